@@ -32,6 +32,7 @@ from companion.settings.model import Settings
 from companion.settings.origins import Origin, Origins, changed, of_options
 from companion.values import Estimate, Event, Output, Refuted, Tick, Tock, Update
 
+SLEEP_S: Final = 3600.0  # longest sleep at once: the system has a limit
 FLUSH_EVERY_S: Final = 1.0  # time between two flushes of the recording
 Progress = Callable[[int, float, float], None]
 """Shows the progress: frames, seconds of log, and wall-clock seconds since the start."""
@@ -290,5 +291,6 @@ def _paced(events: Iterable[Event], speed: float) -> Iterator[Event]:
         if first is None:
             first = (event.t_ns, time.monotonic())
         due_s = first[1] + (event.t_ns - first[0]) * 1e-9 / speed
-        time.sleep(max(0.0, due_s - time.monotonic()))
+        while (left_s := due_s - time.monotonic()) > 0.0:
+            time.sleep(min(left_s, SLEEP_S))
         yield event

@@ -1,4 +1,7 @@
-"""Refuted assumptions, each with the setting that contains it. Each is reported once."""
+"""Refuted assumptions, each with the setting that contains it.
+
+Each is reported once, and again after a minute, since a limit that was raised decays.
+"""
 
 import math
 from typing import Final
@@ -24,19 +27,21 @@ NOTICED_STEP_S: Final = 0.02
 """Least change of a clock or link for a notice: 0.4 m at 20 m/s, which the bound covers."""
 WARNED_STEP_S: Final = 0.1  # change from which the notice is a warning
 GATHERED_NS: Final = 5_000_000_000  # time over which changes are gathered in one notice
-NOTICE_INTERVAL_NS: Final = 60_000_000_000  # least time between two such notices
+NOTICE_INTERVAL_NS: Final = 60_000_000_000  # least time between two equal notices
 NAMED: Final = 6  # largest number of senders named in one notice
 
 
 def notices(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Notice]:
-    """Return refutations, each followed by a notice if it exceeds what was reported before."""
+    """Return refutations, each followed by a notice if it exceeds what was reported lately."""
     out: list[Refuted | Notice] = []
     for one in filter(None, refuted):
         out.append(one)
         record = records[one.uav]
         record.refuted += 1
-        if one.proven > NOTICE_RATIO * record.proven.get(one.setting, 0.0):
-            record.proven[one.setting] = one.proven
+        noticed_ns, proven = record.proven.get(one.setting, (0, 0.0))
+        is_past = one.uav != ARRAY and one.t_ns - noticed_ns > NOTICE_INTERVAL_NS
+        if one.proven > NOTICE_RATIO * proven or is_past:
+            record.proven[one.setting] = one.t_ns, one.proven
             out.append(
                 Notice(
                     t_ns=one.t_ns,

@@ -231,7 +231,14 @@ class Pipeline:
             better = self.tracker.near(fix.position_ned_m, NEAR_M, better_than=fix.uav)
             near = self.targets.unmerged(better)
             tracks = [one.at(fix.t_ns, fix.t_ns) for one in self.snapshots(near)]
-            self.targets.identities.observe(fix, tracks)
+            same_as = self.targets.identities.observe(fix, tracks)
+            if same_as is not None:
+                text = (
+                    f"{fix.uav}: taken for {same_as}, within the errors of both: no beam of its own"
+                )
+                said.append(
+                    Notice(t_ns=fix.arrival_ns, severity=Severity.INFO, subject=fix.uav, text=text)
+                )
         if accepted.reacquired:
             said.append(assumptions.track_restarted(self.records[fix.uav], accepted))
             # Its height may have been wrong when it set the origin.

@@ -52,11 +52,11 @@ class UnusedRun:
 class UavRecord:
     """Record of a UAV, kept until it reboots or its track is dropped.
 
-    proven          largest reported value of each refuted setting
+    proven          of each refuted setting, when it was reported last, and its value
     """
 
     refuted: int = 0  # how often assumptions about it were refuted
-    proven: dict[str, float] = field(default_factory=dict)
+    proven: dict[str, tuple[int, float]] = field(default_factory=dict)
     waits_ns: int | None = None  # start of the wait for its GNSS receiver to confirm its reports
     unused: UnusedRun | None = None  # current run of rejected reports
     unused_notice_ns: int | None = None  # when such a run was last reported

@@ -20,6 +20,8 @@ ANOTHER_CLOCK_NS: Final = 10_000_000_000
 """Time for which a clock is known from its newest stamp here, whatever other nodes share."""
 ANOTHER_CLOCK_LATE_NS: Final = 3_000_000_000
 """Lateness of a stamp here, by a clock that others shared, which shows that this was another."""
+BRINGS_NS: Final = 10_000_000_000
+"""Time after a node's newest position for which its other messages are used."""
 NO_AUTOPILOT: Final = 8  # MAV_AUTOPILOT_INVALID
 AircraftType = tuple[int | None, int | None]
 """Type and autopilot of a vehicle, as MAVLink numbers them."""
@@ -125,11 +127,18 @@ class SharedState:
     received    what this node itself received of its component, which is in force again once it
                 receives a report
     stamped_ns  arrival of the newest stamp that was shared
+    placed_ns   arrival of the newest position of each node, by its link
     """
 
     clock: SenderClock
     received: ComponentState
     stamped_ns: int
+    placed_ns: dict[str, int] = field(default_factory=dict)
+
+    def brings_positions(self, link: str, t_ns: int) -> bool:
+        """Return whether positions of a node are used, so that its other messages are too."""
+        placed_ns = self.placed_ns.get(link)
+        return placed_ns is not None and t_ns - placed_ns <= BRINGS_NS
 
 
 @dataclass(slots=True, kw_only=True)

@@ -208,7 +208,7 @@ class Senders:
                     return _refused(message, Reason.DUPLICATE)
                 if message.uav != self._carrier and not self._admits(message.uav):
                     return _refused(message, Reason.NOT_ALLOWED)
-                return self._telemetry(message, frame.doubt_ns)
+                return self._telemetry(message, frame)
             case AdsbVehicle():
                 if not self._admits(message.uav):
                     return _refused(message, Reason.NOT_ALLOWED)
@@ -263,14 +263,16 @@ class Senders:
     ) -> FrameOutcome:
         """Process a message other than positions: receiver, clock, vehicle or estimator status.
 
-        One that another node shares counts only while positions that others share are used.
+        One that another node shares counts only while positions that it shares are used.
         """
         if type(message) is SystemTime:
             return self._system_time(frame, message)
         name = str(message.source)
         sender = self._senders[name] if name in self._senders else None  # noqa: SIM401 - one call less
         shared = None if sender is None else sender.shared
-        if frame.doubt_ns and shared is None:
+        if frame.doubt_ns and (
+            shared is None or not shared.brings_positions(frame.link, message.t_ns)
+        ):
             return NO_OUTCOME
         if frame.doubt_ns or shared is None:
             component = self._components[message.source]
@@ -370,12 +372,12 @@ class Senders:
             sender.clock.forget_gnss()
             (sender.shared or sender).clock.forget_gnss()
 
-    def _telemetry(self, report: Report, doubt_ns: int = 0) -> FrameOutcome:
+    def _telemetry(self, report: Report, frame: Frame) -> FrameOutcome:
         """Place a report in time by its stamp; noise bounds only for a vehicle that reports itself.
 
-        ``doubt_ns`` is the uncertainty of its frame's arrival: not 0 if another node shared it.
+        The arrival of ``frame`` is uncertain if another node shared it.
         """
-        uav, t_ns, boot_ms = report.uav, report.t_ns, report.boot_ms
+        uav, t_ns, boot_ms, doubt_ns = report.uav, report.t_ns, report.boot_ms, frame.doubt_ns
         assert boot_ms is not None
         kind = kind_of(uav)
         is_own, is_event = kind.reports_itself, kind is UavKind.COT
@@ -388,7 +390,7 @@ class Senders:
         refused: Reason | None = None
         switched: tuple[Notice, ...] = ()
         if doubt_ns or sender.shared is not None:
-            refused, switched = self._switch(sender, report, is_shared=doubt_ns > 0)
+            refused, switched = self._switch(sender, report, frame)
         elif is_event:
             refused = sender.refuses_event(t_ns, boot_ms)
         if refused is not None:
@@ -407,7 +409,7 @@ class Senders:
         sender.is_shared = False
         if stamp is None:
             return self._unplaced(sender, report, said)
-        self._dedupe.set_latency(stamp.latency_s)
+        self._dedupe.set_latency(stamp.latency_s, (t_ns - stamp.oldest_ns) * 1e-9)
         newest = sender.newest
         if is_event and (newest is None or stamp_step(boot_ms, newest[1]) > 0 or stamp.rebooted):
             sender.newest = t_ns, boot_ms
@@ -452,7 +454,7 @@ class Senders:
         return FrameOutcome(outputs=(*said, *late, unused), restarted=uav if said else None)
 
     def _switch(
-        self, sender: Sender, report: Report, *, is_shared: bool
+        self, sender: Sender, report: Report, frame: Frame
     ) -> tuple[Reason | None, tuple[Notice, ...]]:
         """Put in force what other nodes share of a vehicle, or again what this node received.
 
@@ -460,7 +462,7 @@ class Senders:
         """
         assert report.boot_ms is not None
         uav, source, shared = report.uav, report.source, sender.shared
-        if is_shared:
+        if frame.doubt_ns:
             if shared is None:
                 received = self._components[source]
                 shared = sender.shared = SharedState(
@@ -468,8 +470,10 @@ class Senders:
                 )
                 self._components[source] = deepcopy(received)
             shared.stamped_ns = report.t_ns
-            agrees = sender.agrees(report.t_ns, report.boot_ms)
-            return None if agrees else Reason.UNPLACED_STAMP, ()
+            if not sender.agrees(report.t_ns, report.boot_ms):
+                return Reason.UNPLACED_STAMP, ()
+            shared.placed_ns[frame.link] = report.t_ns
+            return None, ()
         if shared is None:
             return None, ()
         self._components[source], sender.shared = shared.received, None
@@ -533,11 +537,11 @@ class Senders:
     def _relayed(self, frame: Frame, said: AdsbVehicle) -> FrameOutcome:
         """Place in time a report of an aircraft that a receiver relays.
 
-        Where the relay's own reports come late over this link, this one is up to as late: half of
-        that is added to its age, and half to the error of the age. The track restarts when the
+        Where the relay's own reports may come late over this link, this one is up to as late: half
+        of that is added to its age, and half to the error of the age. The track restarts when the
         altitude datum changes, since the difference depends on the weather.
         """
-        late_s = self._dedupe.latency_s(frame)
+        late_s = self._dedupe.late_s(frame)
         if late_s > RELAYED_DELAY_S:
             known = said.accuracy or Accuracy()
             time_s = (known.time_s or RELAYED_TIME_ERROR_S) + late_s / 2
@@ -573,7 +577,7 @@ class Senders:
             return _refused(named, Reason.DUPLICATE)
         if named.boot_ms is None:
             return _refused(named, Reason.UNPLACED_STAMP)
-        return self._telemetry(named)
+        return self._telemetry(named, frame)
 
     def _attitude(self, attitude: Attitude) -> FrameOutcome:
         carrier = str(attitude.source)

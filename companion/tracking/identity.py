@@ -21,16 +21,18 @@ REPORTS_TO_DECIDE: Final = 5  # reports in a row that identify, or separate, two
 SPEED_APART_MPS: Final = 15.0  # difference in velocity above which two tracks are two aircraft
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Relayed:
     """State of a relayed aircraft, for its identification.
 
     same_as   the better track of the same aircraft; None if there is none
+    announced the better track that ``observe`` returned last
     """
 
     near: str  # the nearest better track; empty if none is near enough
     in_a_row: int = 0  # newest reports for which ``near`` did not change
     same_as: str | None = None
+    announced: str | None = None
 
 
 class Identities:
@@ -50,8 +52,11 @@ class Identities:
         self._relayed.pop(uav, None)
         self.merged.discard(uav)
 
-    def observe(self, relayed: Fix, better: list[Track]) -> None:
-        """Compare a relayed report with the better tracks at its time."""
+    def observe(self, relayed: Fix, better: list[Track]) -> str | None:
+        """Compare a relayed report with the better tracks at its time.
+
+        Return the track that it is identified with, if that is not the one returned last.
+        """
         known = self._relayed.get(relayed.uav)
         same_as = None if known is None else known.same_as
         near = [
@@ -63,7 +68,7 @@ class Identities:
         nearest = min((pair for pair in near if pair[0] is not None), default=None)
         match = nearest[1] if nearest else ""
         if known is None:
-            known = self._relayed[relayed.uav] = _Relayed(match)
+            known = self._relayed[relayed.uav] = _Relayed(near=match)
             if len(self._relayed) > RELAYED_MAX:
                 self.forget(next(iter(self._relayed)))
         elif known.near != match:
@@ -74,6 +79,10 @@ class Identities:
             self.merged.discard(relayed.uav)
             if match:
                 self.merged.add(relayed.uav)
+                if match != known.announced:
+                    known.announced = match
+                    return match
+        return None
 
 
 def _apart_m(relayed: Fix, track: Track) -> float | None:

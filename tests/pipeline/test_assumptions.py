@@ -1,7 +1,7 @@
 """Assumptions about aircraft, and the notices when reports refute them, in the whole pipeline."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -364,6 +364,24 @@ def test_link_that_becomes_fast_refutes_the_positions_before_it() -> None:
     (track,) = there.tracks(START_NS + 30 * S, START_NS + 30 * S)
     off_m = math.dist(track.position_ned_m, (300, 0, 0))
     assert off_m < track.horizontal_bound_m
+
+
+def test_limit_that_is_refuted_again_is_announced_again() -> None:
+    """It decays: the bound was 10 m too small for 2 s, minutes after the only notice."""
+    there = pipeline()
+
+    def frames() -> Iterator[Frame]:
+        east = 0.0
+        for n in range(6000):
+            moves = n % 2000 >= 1900  # for ten seconds, every 200 s
+            east += 1.2 if moves else 0.0
+            yield position(0.1 * n, "7:1", (100, east, 0))
+
+    said = run(there, frames())
+    notices = [one for one in said if isinstance(one, Notice) and "contradict" in one.text]
+    for began_s in (190, 390, 590):
+        since = [one for one in notices if 0 < (one.t_ns - START_NS) / S - began_s < 5.0]
+        assert since, began_s
 
 
 def test_velocities_that_the_positions_contradict_widen_the_bound() -> None:

@@ -41,11 +41,19 @@ from sitl_replay.flight.scenario import Scenario
 from sitl_replay.flight.vehicles import schedule
 
 
-def adsb(t_s: float, ned_m: tuple[float, float, float], flags: int = 1 | 2) -> Frame:
+def adsb(
+    t_s: float,
+    ned_m: tuple[float, float, float],
+    flags: int = 1 | 2,
+    *,
+    east_mps: float | None = None,
+    tslc_s: int = 1,
+) -> Frame:
+    flags |= 0 if east_mps is None else 4 | 8
     lat, lon, alt = pymap3d.ned2geodetic(*ned_m, *PLACE)
     message = dialect.MAVLink_adsb_vehicle_message(
         0x4CA7B3, round(float(lat) * 1e7), round(float(lon) * 1e7), 1, round(float(alt) * 1e3),
-        0, 0, 0, b"TEST", 0, 1, flags, 0,
+        9000, round(100 * (east_mps or 0.0)), 0, b"TEST", 0, tslc_s, flags, 0,
     )  # fmt: skip
     return sent(t_s, "5:1", message)
 
@@ -759,6 +767,44 @@ def test_relayed_report_over_a_late_link_may_be_as_late(is_repeated: bool) -> No
     assert seen.fix.noise.horizontal_m == pytest.approx(horizontal_m, abs=20.0)
     (other,) = Pipeline(settings("47.4,8.55,500")).step(adsb(10.0, (3000, 500, -800)))
     assert isinstance(other, Estimate) and other.fix.t_ns == other.fix.arrival_ns - S
+
+
+@pytest.mark.parametrize("late_s", [2.5, 4.0])
+def test_bound_of_a_relayed_aircraft_holds_while_its_relay_is_late(late_s: float) -> None:
+    """Lateness that lasts looks like a clock that stalled; 932 m off at 581 m, without a notice.
+
+    The first late message of the aircraft comes before the first late position of the relay.
+    """
+    pipeline = Pipeline(settings("47.4,8.55,500", observer={"speed_max_mps": 300.0}))
+    sent_s = [("relay", 0.25 * n) for n in range(400)] + [("aircraft", n - 0.1) for n in range(100)]
+    worst = 0.0
+    for which, t_s in sorted(sent_s, key=lambda one: one[1]):
+        at_s = t_s + (late_s if t_s > 19.8 else 0.05)
+        if which == "relay":
+            pipeline.step(position(at_s, "5:1", boot_s=100 + t_s, link="udp"))
+            continue
+        place = -3000.0 + 230.0 * t_s
+        pipeline.step(adsb(at_s, (3000, place, -800), east_mps=230.0, tslc_s=0))
+        if t_s < 1.0:
+            continue
+        now_ns = START_NS + round(at_s * S)
+        (track,) = (one for one in pipeline.tracks(now_ns, now_ns) if one.uav.startswith("icao"))
+        off_m = math.dist(track.position_ned_m[:2], (3000, -3000.0 + 230.0 * at_s))
+        worst = max(worst, off_m / track.horizontal_bound_m)
+    assert 0.1 < worst < 1.0
+
+
+def test_aircraft_that_is_taken_for_another_is_announced_once() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500", beams={"targets": "all"}))
+    texts = list[str]()
+    for n in range(100):
+        t_s, place = 0.5 * n, (3000, 10.0 * n, -800)
+        if n // 30 % 2:  # it parts, and returns
+            place = (4000, 10.0 * n, -800)
+        outputs = pipeline.step(position(t_s, "1:1", (3000, 10.0 * n, -800), (0, 20, 0)))
+        outputs += pipeline.step(adsb(t_s, place, east_mps=20.0, tslc_s=0))
+        texts += [one.text for one in outputs if isinstance(one, Notice) and "taken" in one.text]
+    assert texts == ["icao:4CA7B3: taken for 1:1, within the errors of both: no beam of its own"]
 
 
 def test_track_restart_is_announced_once() -> None:

@@ -16,6 +16,7 @@ messages, with or without changes, and not every message has every field:
 See docs/field-notes.md 1 for the behaviour of real relays.
 """
 
+import math
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Final, TypeVar
@@ -38,6 +39,9 @@ DO-260B), so older ones are seldom needed.
 """
 REPEATED_NS: Final = 30 * _NS
 """How long the same position counts as a repeat; later, the aircraft may be hovering."""
+HOVERING_NS: Final = 3 * _NS
+"""The same if the aircraft states that it hovers: relays repeat a message for up to 2.6 s."""
+HOVERING_MPS: Final = 1.0  # largest speed of a hovering aircraft: steps of a knot, and noise
 FORGOTTEN_S: Final = 120
 """Seconds without a message after which an aircraft is forgotten; older messages are discarded."""
 AIRCRAFT_MAX: Final = 2000
@@ -86,7 +90,19 @@ class _RelayedAircraft:
         if before is None or _differs(before, message):
             return None
         is_later = message.true_ns - before.true_ns >= SLACK_NS
-        return None if is_later and message.t_ns - before.t_ns > REPEATED_NS else before
+        repeated_ns = HOVERING_NS if self._hovers(message) else REPEATED_NS
+        return None if is_later and message.t_ns - before.t_ns > repeated_ns else before
+
+    def _hovers(self, message: AdsbVehicle) -> bool:
+        """Return whether the aircraft states that it hovers, where it was reported last.
+
+        A relay that lags still says so when others have reported that it flies on.
+        """
+        if message.position_deg is None or not self.reported.is_newest(message.position_deg):
+            return False
+        velocity_mps = _fitting(message.velocity_ne_mps, self.velocity_ne, message.true_ns)
+        down_mps = _fitting(message.velocity_down_mps, self.velocity_down, message.true_ns) or 0.0
+        return velocity_mps is not None and math.hypot(*velocity_mps, down_mps) <= HOVERING_MPS
 
     def altitude(self, message: AdsbVehicle) -> tuple[AltitudeDatum, float, int] | None:
         """Return datum, metres and age (ns) of the altitude that belongs to a new position."""

@@ -17,6 +17,7 @@ LINKS_MAX: Final = 4096  # most links counted; a log may name one for each of it
 LATENCIES_KEPT: Final = 256  # newest latencies kept per link
 LATENCY_KEPT_NS: Final = 10_000_000_000
 """How long the latency of a system's newest report tells how late its other messages are."""
+OVERDUE_INTERVALS: Final = 2  # intervals between reports after which the next one is overdue
 
 
 @dataclass(slots=True)
@@ -33,12 +34,13 @@ class LinkShare:
 
 @dataclass(slots=True, kw_only=True)
 class _First:
-    """First arrival of a report; its latency is None until known."""
+    """First arrival of a report; its latency is None until known, and at most ``age_s``."""
 
     t_ns: int
     link: str
     sysid: int
     latency_s: float | None = None
+    age_s: float = 0.0
 
 
 class Dedupe:
@@ -48,8 +50,8 @@ class Dedupe:
         self.shares: dict[str, LinkShare] = {}
         self._seen: OrderedDict[bytes, _First] = OrderedDict()  # in order of arrival
         self._newest: _First | None = None  # of these
-        self._latest: dict[tuple[str, int], tuple[int, float]] = {}
-        """Arrival and latency of the newest report, by link and system."""
+        self._latest: dict[tuple[str, int], tuple[int, float, int]] = {}
+        """Arrival, age and interval of the newest report, by link and system."""
 
     def is_repeat(self, frame: Frame) -> bool:
         """Count a frame; return True if the same content arrived before it, within the window."""
@@ -65,32 +67,37 @@ class Dedupe:
             return False
         share.repeats += 1
         if first.latency_s is not None:
-            latency_s = first.latency_s + (t_ns - first.t_ns) * 1e-9
-            share.latencies_s.append(latency_s)
-            self._note((frame.link, first.sysid), t_ns, latency_s)
+            repeated_s = (t_ns - first.t_ns) * 1e-9
+            share.latencies_s.append(first.latency_s + repeated_s)
+            self._note((frame.link, first.sysid), t_ns, first.age_s + repeated_s)
         return True
 
-    def set_latency(self, latency_s: float) -> None:
-        """Set the latency, in seconds, of the last new report."""
+    def set_latency(self, latency_s: float, age_s: float) -> None:
+        """Set the likely and the largest latency, in seconds, of the last new report."""
         first = self._newest
         assert first is not None
-        first.latency_s = latency_s
+        first.latency_s, first.age_s = latency_s, age_s
         self._share(first.link).latencies_s.append(latency_s)
-        self._note((first.link, first.sysid), first.t_ns, latency_s)
+        self._note((first.link, first.sysid), first.t_ns, age_s)
 
-    def latency_s(self, frame: Frame) -> float:
-        """Return the latency of the newest report of a frame's system over its link.
+    def late_s(self, frame: Frame) -> float:
+        """Return how late a frame of another message may be, by the reports of its system.
 
-        0 if there was none in the last ``LATENCY_KEPT_NS``.
+        The newest one over the same link may be as late. If the next one is overdue, all that comes
+        may be late by that time. 0 if there was none in the last ``LATENCY_KEPT_NS``.
         """
-        t_ns, latency_s = self._latest.get(
-            (frame.link, frame.source.sysid), (-LATENCY_KEPT_NS, 0.0)
-        )
-        return latency_s if frame.t_ns - t_ns <= LATENCY_KEPT_NS else 0.0
+        newest = self._latest.get((frame.link, frame.source.sysid))
+        if newest is None or frame.t_ns - newest[0] > LATENCY_KEPT_NS:
+            return 0.0
+        t_ns, age_s, interval_ns = newest
+        overdue_ns = frame.t_ns - t_ns - OVERDUE_INTERVALS * interval_ns
+        return max(age_s, age_s + overdue_ns * 1e-9)
 
-    def _note(self, of: tuple[str, int], t_ns: int, latency_s: float) -> None:
-        if of in self._latest or len(self._latest) < LINKS_MAX:
-            self._latest[of] = (t_ns, latency_s)
+    def _note(self, of: tuple[str, int], t_ns: int, age_s: float) -> None:
+        before = self._latest.get(of)
+        if before is not None or len(self._latest) < LINKS_MAX:
+            interval_ns = LATENCY_KEPT_NS if before is None else t_ns - before[0]
+            self._latest[of] = t_ns, age_s, interval_ns
 
     def _share(self, link: str) -> LinkShare:
         share = self.shares.get(link)

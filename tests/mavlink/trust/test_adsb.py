@@ -4,11 +4,13 @@ Messages are packed by pymavlink's generated dialect. The model (``Model``) keep
 and derives each result from all of them.
 """
 
+import math
 import tracemalloc
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -278,6 +280,36 @@ def test_hovering_aircraft_is_reported_again_after_a_while() -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("stated", ["with", "before"])
+def test_aircraft_that_states_that_it_hovers_is_reported_every_few_seconds(stated: str) -> None:
+    """Some transponders send velocities in messages of their own."""
+    aircraft = Aircraft()
+    reports = 0
+    for n in range(1000):
+        t_s = n / 10
+        with_it: dict[str, Any] = {"velocity": (90, 0.5), "climb": 0.5} if stated == "with" else {}
+        if stated == "before":
+            aircraft.merge(said(t_s, None, velocity=(90, 0.5)))
+        reports += type(aircraft.merge(said(t_s, alt=500, **with_it))) is Report
+    assert reports == 33  # every 3.1 s
+
+
+@pytest.mark.parametrize("climb", [0.0, 0.9])
+def test_aircraft_that_moves_slowly_is_not_taken_for_one_that_hovers(climb: float) -> None:
+    aircraft = Aircraft()
+    moves: dict[str, Any] = {"velocity": (45, 1.1 - climb / 2), "climb": climb}
+    report(aircraft.merge(said(0, alt=500, **moves)))
+    assert refused(aircraft.merge(said(29, alt=500, **moves))) is Reason.DUPLICATE
+
+
+def test_hover_that_a_lagging_relay_still_states_is_a_duplicate() -> None:
+    aircraft = Aircraft()
+    report(aircraft.merge(said(0, alt=500, velocity=(0, 0))))
+    report(aircraft.merge(said(1, THERE, alt=500, velocity=(0, 5))))
+    late = said(5, alt=500, velocity=(0, 0), relay=6)
+    assert refused(aircraft.merge(late)) is Reason.DUPLICATE
+
+
 @pytest.mark.parametrize(
     "moved", [{"alt": 501.0}, {"climb": 2.0}, {"velocity": (0.0, 61.0)}, {"at": THERE}]
 )
@@ -461,7 +493,8 @@ class Model:
         then_ns = m.t_ns - m.tslc_s * S
         for before in [r for r in self.reports if m.position_deg and at(r) == at(m)][-1:]:
             was_ns = before.t_ns - before.tslc_s * S
-            hovers = m.t_ns > before.t_ns + 30 * S and then_ns >= was_ns + S
+            wait_s = 3 if before is self.reports[-1] and self.states_hover(m, then_ns) else 30
+            hovers = m.t_ns > before.t_ns + wait_s * S and then_ns >= was_ns + S
             if not hovers and not disagree(before, m):
                 self.learned.append((was_ns, m))
                 return Reason.DUPLICATE
@@ -497,6 +530,11 @@ class Model:
         known = self.newest(lambda each: getattr(each, name))
         return known[1] if known and abs(known[0] - then_ns) <= S else None
 
+    def states_hover(self, m: AdsbVehicle, then_ns: int) -> bool:
+        north_east = self.fitting(m, then_ns, "velocity_ne_mps")
+        down: Any = self.fitting(m, then_ns, "velocity_down_mps")
+        return isinstance(north_east, tuple) and math.hypot(*north_east, down or 0.0) <= 1.0
+
     def relays(self) -> tuple[Source, ...]:
         if not self.heard:
             return ()
@@ -523,7 +561,7 @@ MESSAGES = st.fixed_dictionaries(
         "at": st.sampled_from([None, HERE, THERE, YONDER, (47.5, 8.0), (47.6, 8.0)]),
         "alt": st.sampled_from([None, None, 500.0, 510.0]),
         "datum": st.sampled_from([GEOMETRIC, PRESSURE]),
-        "velocity": st.sampled_from([None, (0.0, 60.0), (90.0, 70.0)]),
+        "velocity": st.sampled_from([None, (0.0, 60.0), (90.0, 70.0), (90.0, 0.0)]),
         "climb": st.sampled_from([None, 0.0, 3.0]),
         "callsign": st.sampled_from([None, "ONE", "TWO"]),
         "tslc": st.sampled_from([0, 0, 0, 1, 1, 2, 3, 11, 119, 120]),

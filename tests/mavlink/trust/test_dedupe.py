@@ -114,7 +114,7 @@ def test_number_of_counted_links_is_bounded() -> None:
     dedupe = Dedupe()
     for number in range(LINKS_MAX + 100):
         assert not dedupe.is_repeat(sent(link=f"udp:{number}", boot_ms=number))
-        dedupe.set_latency(0.1)
+        dedupe.set_latency(0.1, 0.1)
     assert len(dedupe.shares) == LINKS_MAX
     assert dedupe.is_repeat(sent(link="udp:0", boot_ms=LINKS_MAX + 50))
     assert dedupe.shares["udp:0"].repeats == 1
@@ -129,7 +129,7 @@ def test_first_link_and_link_latencies_are_counted() -> None:
             if link == "a" and n % 10 == 0:
                 continue
             if not dedupe.is_repeat(sent(t_ns + late_ns, link, boot_ms=n * 100)):
-                dedupe.set_latency(0.1 + late_ns / S)
+                dedupe.set_latency(0.1 + late_ns / S, 0.2)
     a, b = dedupe.shares["a"], dedupe.shares["b"]
     assert (a.first, a.repeats, b.first, b.repeats) == (90, 0, 10, 90)
     assert list(a.latencies_s) == pytest.approx([0.1] * 90)

@@ -104,6 +104,16 @@ def test_accuracies_of_others_lower_no_bound_in_a_gap_or_after_it(reports: bool)
     assert min(fix.noise.position_m for fix in fixes) > 1.0
 
 
+def test_accuracies_of_a_node_that_shares_no_reports_lower_no_bound() -> None:
+    """Beside another node's reports: 2.2 times beyond the bound, and then no link."""
+    honest = [shared(own(5 + n / 10)) for n in range(350)]
+    lies = [shared(accuracy(5 + n / 10))._replace(link="fleet:c") for n in range(350)]
+    _, outputs = flown(*honest, *lies, gap_s=(5, 40), end_s=40.0)
+    fixes = [one.fix for one in outputs if isinstance(one, Estimate)]
+    assert len(fixes) > 350
+    assert min(fix.noise.position_m for fix in fixes) > 1.0
+
+
 def test_accuracies_of_others_without_their_reports_count_for_nothing() -> None:
     """Not even once the vehicle has been silent for so long that its clock is not known here."""
     lies = [shared(accuracy(21 + n / 10)) for n in range(9)]

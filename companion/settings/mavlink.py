@@ -156,7 +156,7 @@ class TrackSettings(Section):
     stale_s: Age = 15.0
     lost_s: Age = 60.0
     dropped_s: Age = 600.0
-    most: Annotated[int, Field(ge=1, le=100_000)] = 2000
+    most: Annotated[int, Field(ge=1, le=100_000)] = 1000
     window_s: Annotated[float, Field(gt=0, le=3600)] = 5.0
     reacquire_reports: Annotated[int, Field(ge=2, le=60)] = 3
     reacquire_s: Annotated[float, Field(ge=0, le=60)] = 1.0

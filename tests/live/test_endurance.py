@@ -34,7 +34,7 @@ SHORT_S, LONG_S = 5.0, 15.0
 GROWS_MB = 30.0
 MAP_MB = 40.0  # threads that read files, and 64 kB of each answer that is not read
 FULL_TABLE_MB = 40.0
-"""For 2000 tracks, the limit of ``[tracks] most``: 10 kB each, besides what time alone takes."""
+"""For 1000 tracks, the limit of ``[tracks] most``: 10 kB each, besides what time alone takes."""
 CROWD_MB = 100.0  # of a crowd that is tracked besides, and answers that are computed
 UDP = "udpin:127.0.0.1:0"
 

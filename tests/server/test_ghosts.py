@@ -8,13 +8,15 @@ import threading
 import time
 from collections import Counter
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
 from siege import besieged
 from support import HANG_S, ROOT, Node
 
-GHOSTS = 1990  # with the honest vehicles as many as `[tracks] most`
+GHOSTS = 1990
+MOST = "[tracks]\nmost = 2000\n"
 ALL_AT_ONCE = (
     "from companion.mavlink.trust import newcomers\n"
     "newcomers.NEW_SAVED = 10_000.0\n"
@@ -82,8 +84,16 @@ def updates_hz(node: Node, seconds: float) -> float:
     return float(after - before) / (time.monotonic() - begun_s)
 
 
-def test_beams_are_updated_while_clients_ask_for_all_uavs(start_node: Any) -> None:
-    with besieged(partial(start_node, code=ALL_AT_ONCE)) as node:
+@pytest.fixture
+def settings(tmp_path: Path) -> str:
+    """Settings with twice as many tracks as by default."""
+    path = tmp_path / "companion.toml"
+    path.write_text(MOST)
+    return str(path)
+
+
+def test_beams_are_updated_while_clients_ask_for_all_uavs(start_node: Any, settings: str) -> None:
+    with besieged(partial(start_node, code=ALL_AT_ONCE), "--config", settings) as node:
         invade(node)
         shares = []
         for _ in range(ROUNDS):  # other load on this machine may slow one of two measurements
@@ -101,9 +111,9 @@ def test_beams_are_updated_while_clients_ask_for_all_uavs(start_node: Any) -> No
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("routes", [*((route,) for route in ROUTES), ROUTES], ids="+".join)
 def test_beams_are_updated_while_clients_ask_for_all_uavs_soak(
-    start_node: Any, routes: tuple[str, ...]
+    start_node: Any, settings: str, routes: tuple[str, ...]
 ) -> None:
-    with besieged(partial(start_node, code=ALL_AT_ONCE)) as node:
+    with besieged(partial(start_node, code=ALL_AT_ONCE), "--config", settings) as node:
         invade(node)
         with Clients(node, routes):
             rates = [updates_hz(node, 4.0) for _ in range(3)]

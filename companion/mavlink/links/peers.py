@@ -33,6 +33,11 @@ SENDERS_MAX: Final = 16_384
 
 Beyond the limit all are reset, which loses only the gaps of that moment.
 """
+COMPONENTS_MAX: Final = 4096
+"""Most sources whose frames are counted; beyond it an eighth is forgotten, the silent ones first.
+
+A source of its own in each frame would otherwise fill the memory within the hour.
+"""
 RESTART_RUN: Final = 3  # late frames in a row, in increasing order, that prove a restart
 
 STAMPS_KEPT_NS: Final = 30_000_000_000
@@ -57,13 +62,16 @@ class Splits(Protocol):
 
 
 class _Component:
-    """One source over the whole link: its counts, and the peer over which it was last received."""
+    """One source over the whole link: its counts, and the peer over which it was last received.
+
+    The peer is None once it is forgotten.
+    """
 
     __slots__ = ("peer", "status")
 
     def __init__(self, status: ComponentStatus, peer: "Peer") -> None:
         self.status = status
-        self.peer = peer
+        self.peer: Peer | None = peer
 
 
 class _PeerSender:
@@ -177,6 +185,9 @@ class Peers:
         """Remove a peer that disconnected or is evicted."""
         del self._peers[peer.key]
         self._senders -= len(peer.senders)
+        for sender in peer.senders.values():
+            if sender.component.peer is peer:
+                sender.component.peer = None
 
     def active_since(self, t_ns: int) -> list[Peer]:
         """Return the peers from which a frame arrived at ``t_ns`` or later."""
@@ -189,9 +200,7 @@ class Peers:
         which the source was last received.
         """
         component = self._components.get(source)
-        if component is None or self._peers.get(component.peer.key) is not component.peer:
-            return None
-        return component.peer
+        return None if component is None else component.peer
 
     def count(
         self,
@@ -240,8 +249,7 @@ class Peers:
 
     def _prefer(self, component: _Component, peer: Peer, source: Source, t_ns: int) -> None:
         """Send messages to this peer from now on, unless the other is believed and connected."""
-        is_gone = self._peers.get(component.peer.key) is not component.peer
-        if is_gone or self._is_first(peer, source, t_ns):
+        if component.peer is None or self._is_first(peer, source, t_ns):
             component.peer = peer
 
     def pass_over(self, peer: Peer, source: Source) -> None:
@@ -281,13 +289,29 @@ class Peers:
         """Start to follow a source of this peer; its first sequence number counts as expected."""
         component = self._components.get(frame.source)
         if component is None:
+            if len(self._components) >= COMPONENTS_MAX:
+                self._forget_silent()
             counts = ComponentStatus(frames=0, gaps=0, heard_ns=frame.t_ns, mavlink=frame.version)
             self._status.components[frame.source] = counts
             component = self._components[frame.source] = _Component(counts, peer)
         if self._senders >= SENDERS_MAX:
-            for known in self._peers.values():
-                known.senders.clear()
-            self._senders = 0
+            self._reset_senders()
         sender = peer.senders[frame.source] = _PeerSender(component, frame.seq)
         self._senders += 1
         return sender
+
+    def _reset_senders(self) -> None:
+        """Follow no sequence any more; a component's frames go to the peer that is heard next."""
+        for known in self._peers.values():
+            known.senders.clear()
+        for component in self._components.values():
+            component.peer = None
+        self._senders = 0
+
+    def _forget_silent(self) -> None:
+        """Forget the counts of the sources that have been silent for longest."""
+        components = self._status.components
+        silent = sorted(components, key=lambda source: components[source].heard_ns)
+        for source in silent[: COMPONENTS_MAX // 8]:
+            del components[source], self._components[source]
+        self._reset_senders()

@@ -1,5 +1,6 @@
 """Sequence numbers by peer and source: gaps, late frames, repeats and restarts."""
 
+import gc
 import random
 from collections.abc import Iterable
 
@@ -10,9 +11,17 @@ from link_support import frame
 from support import rounds
 
 from companion.mavlink.links import peers as peers_module
-from companion.mavlink.links.peers import PEERS_MAX, RESTART_RUN, SENDERS_MAX, Peer, Peers
+from companion.mavlink.links.peers import (
+    COMPONENTS_MAX,
+    PEERS_MAX,
+    RESTART_RUN,
+    SENDERS_MAX,
+    Peer,
+    Peers,
+)
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.wire.framing import Splitter
+from companion.settings.model import Settings
 from companion.values import Frame, Reason, Rejection, Source
 
 UAV = Source(1, 1)
@@ -217,6 +226,27 @@ def test_invented_senders_use_bounded_memory(monkeypatch: pytest.MonkeyPatch) ->
             for key in range(7):
                 heard.peers.forget(heard.peers.at(f"bad {key}"))
     assert heard.counts == (0, 0, 0)
+
+
+def test_sources_from_ever_new_peers_use_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Evicted peers were kept by the sources that they had sent: 421 MB after nine minutes."""
+    monkeypatch.setattr(peers_module, "PEERS_MAX", 50)
+    monkeypatch.setattr(peers_module, "COMPONENTS_MAX", 200)
+    heard = Heard()
+    for n in range(2000):
+        source = Source(2 + n // 250, 1 + n % 250)
+        heard.hear([n], "steady", t_ns=n).hear([5], f"new {n}", source, t_ns=n)
+        heard.farewells.clear()
+        assert len(heard.status.components) <= 200
+        assert heard.peers.route_to(source) is heard.peers.find(f"new {n}")
+    assert sum(type(one) is Peer for one in gc.get_objects()) < 100
+    assert heard.status.components[UAV].frames == 2000
+    assert heard.hear([2000], "steady").peers.route_to(UAV) is heard.peers.find("steady")
+    assert heard.counts == (0, 0, 0)
+
+
+def test_default_limit_of_sources_exceeds_that_of_tracks() -> None:
+    assert Settings().tracks.most < COMPONENTS_MAX
 
 
 def test_evicted_peers_do_not_affect_active_ones(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,7 +78,7 @@ OLDEST: Final = (
 )
 RECEIVER: Final = (
     f"{100 * transport.RECEIVER_SHARE:.0f} % of the time for a link,"
-    f" {transport.RECEIVER_SAVED_S:g} s at once"
+    f" {100 * transport.RECEIVERS_SHARE:.0f} % for all, {transport.RECEIVER_SAVED_S:g} s at once"
 )
 LOOP: Final = (
     f"{request_queue.AT_ONCE} started in an iteration; less than 2 ms each on the event loop"

@@ -17,6 +17,7 @@ from companion.mavlink.links.transport import Link, MessageSigning
 from companion.mavlink.links.urls import parse_link
 from companion.mavlink.wire.foreign import ForeignSplitter
 from companion.values import Frame, Notice, Rejection
+from companion.values.budget import Budget
 
 LIMIT_S = 20.0
 """A test that waits this long has failed."""
@@ -121,7 +122,10 @@ async def until_true(enough: Callable[[], bool]) -> None:
 
 @contextlib.asynccontextmanager
 async def running(
-    url: str, now_ns: Callable[[], int] | None = None, guard: MessageSigning | None = None
+    url: str,
+    now_ns: Callable[[], int] | None = None,
+    guard: MessageSigning | None = None,
+    receivers_s: Budget | None = None,
 ) -> AsyncIterator[tuple[Link, Inbox]]:
     """A link that is open and runs, and is cancelled at the end. Its time is 1, 2, 3 …"""
     inbox, clock = Inbox(), count(1)
@@ -131,6 +135,7 @@ async def running(
         now_ns=now_ns or (lambda: next(clock)),
         notify=inbox.notify,
         guard=guard,
+        receivers_s=receivers_s,
     )
     link.open()
     task = asyncio.create_task(link.run())

@@ -13,7 +13,7 @@ from typing import Final
 from companion.mavlink.links.daemon_threads import in_daemon_thread
 from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.signing_store import Timestamps, key_warning, load_key
-from companion.mavlink.links.transport import Link
+from companion.mavlink.links.transport import Link, receivers_budget
 from companion.mavlink.links.urls import LinkError, parse_link
 from companion.mavlink.trust.admission import admission
 from companion.mavlink.trust.known_peers import KnownPeers
@@ -81,6 +81,7 @@ class Gateway:
         signed = set(settings.signing.keys) - set(settings.signing.allow_unsigned)
         self._known_peers = KnownPeers({*settings.links.routers, *signed})
         self._newcomers = Newcomers(_named(settings))
+        self._receivers_s = receivers_budget()
         self._refusal_notice_ns = -NOTICE_EVERY_NS
         self._settings = settings
         self.links: list[Link] = []
@@ -127,6 +128,7 @@ class Gateway:
             lag=self.lag,
             known_peers=self._known_peers,
             newcomers=self._newcomers,
+            receivers_s=self._receivers_s,
         )
 
     async def run(self) -> None:

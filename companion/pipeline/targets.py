@@ -81,6 +81,8 @@ class Targets:
         notices = []
         for uav in changed:
             bad = states[uav] in (TrackState.STALE, TrackState.LOST)
+            if bad:
+                self.identities.separate(uav)
             severity = Severity.WARNING if bad else Severity.INFO
             notices.append(
                 Notice(t_ns=now_ns, severity=severity, subject=uav, text=f"{uav} is {states[uav]}")

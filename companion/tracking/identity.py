@@ -52,6 +52,13 @@ class Identities:
         self._relayed.pop(uav, None)
         self.merged.discard(uav)
 
+    def separate(self, better: str) -> None:
+        """Separate all relayed aircraft from a track that is too old for a beam."""
+        for uav in [one for one in self.merged if self._relayed[one].same_as == better]:
+            known = self._relayed[uav]
+            known.same_as, known.near, known.in_a_row = None, "", 0
+            self.merged.discard(uav)
+
     def observe(self, relayed: Fix, better: list[Track]) -> str | None:
         """Compare a relayed report with the better tracks at its time.
 

@@ -794,6 +794,21 @@ def test_bound_of_a_relayed_aircraft_holds_while_its_relay_is_late(late_s: float
     assert 0.1 < worst < 1.0
 
 
+def test_aircraft_has_a_beam_as_soon_as_the_vehicle_that_it_was_taken_for_is_stale() -> None:
+    pipeline = Pipeline(settings("47.4,8.55,500", beams={"targets": "all"}))
+    served = list[tuple[str, ...]]()
+    for n in range(400):
+        t_s = 0.1 * n
+        place = (3000, 20.0 * t_s, -800)
+        if n < 100:
+            pipeline.step(position(t_s, "1:1", place, (0, 20, 0)))
+        if n % 10 == 0:
+            pipeline.step(adsb(t_s, place, east_mps=20.0, tslc_s=0))
+        served.append(updated(pipeline, t_s).beams.uavs)
+    assert sum(not uavs for uavs in served[10:]) <= 1, "until the next update"
+    assert served[-1] == ("icao:4CA7B3",)
+
+
 def test_aircraft_that_is_taken_for_another_is_announced_once() -> None:
     pipeline = Pipeline(settings("47.4,8.55,500", beams={"targets": "all"}))
     texts = list[str]()

@@ -101,7 +101,7 @@ def test_beams_are_updated_while_clients_ask_for_all_uavs(start_node: Any, setti
             with Clients(node, ROUTES) as clients:
                 shares.append(updates_hz(node, 4.0) / alone_hz)
             assert set(clients.statuses) == {200}
-            assert clients.statuses[200] > CLIENTS
+            assert clients.statuses[200] >= CLIENTS
             if shares[-1] > SHARE:
                 break
     assert max(shares) > SHARE

@@ -106,6 +106,18 @@ def test_merged_tracks_separate_when_they_part(fix: MakeFix) -> None:
     assert after(fix, [30.0] * 8 + [900.0] * REPORTS_TO_DECIDE) is None
 
 
+def test_aircraft_is_separated_at_once_from_a_track_that_is_too_old(fix: MakeFix) -> None:
+    """Neither had a beam until five more reports."""
+    identities = Identities()
+    for n in range(REPORTS_TO_DECIDE):
+        here = [20.0 * n, 0, -300]
+        identities.observe(relayed(fix, n, [20.0 * n, 30.0, -310]), [track("1:1", here)])
+    identities.separate("2:1")
+    assert identities.merged == {AIRCRAFT}
+    identities.separate("1:1")
+    assert (identities.merged, identities.same_as(AIRCRAFT)) == (set(), None)
+
+
 # --- bounds on a report's errors ------------------------------------------------------------------
 
 DEFAULT = ReportNoise(horizontal_m=3.0, vertical_m=3.0, position_m=3.0, velocity_mps=0.5)

@@ -13,6 +13,8 @@ A sender that restarts jumps anywhere. A jump forwards looks like a gap: one wro
 After a jump backwards every frame would look late until the sender has caught up. Therefore
 ``RESTART_RUN`` late frames in a row, in increasing order, count as a restart, which adds no gap.
 Stragglers between frames in order never form such a run.
+
+Over 300 lines: the peers, and what is followed and counted of each.
 """
 
 from collections import OrderedDict

@@ -66,6 +66,8 @@ A receiver reports any number of aircraft under one sender id, so ``newcomers`` 
 One aircraft's position takes 0.1 to 0.3 ms: a thousand a second fit, as in a dense sky.
 """
 RECEIVER_SAVED_S: Final = 0.5  # time that a receiver may take at once, as for a large document
+RECEIVERS_SHARE: Final = 0.5  # share of the time that all receivers together may take
+RECEIVERS_SAVED_S: Final = 1.0
 UNFINISHED_S: Final = 10
 """Seconds of received bytes without a complete message after which a connection is closed."""
 PEER_ACTIVE_S: Final = 10.0
@@ -89,6 +91,11 @@ class MessageSigning(Protocol):
         """Return a packed MAVLink 2 frame with its signature appended."""
 
 
+def receivers_budget() -> Budget:
+    """Return a budget for all receivers together, in seconds of work."""
+    return Budget(per_s=RECEIVERS_SHARE, most=RECEIVERS_SAVED_S)
+
+
 class Link:
     """One link of the service, of any scheme.
 
@@ -102,6 +109,7 @@ class Link:
         lag            records how late datagrams are processed
         known_peers    rejects frames of strangers in the name of others; shared by all links
         newcomers      limits new senders; shared by all links
+        receivers_s    seconds that all receivers together may take; shared by all links
 
     All methods but ``open`` must be called on the event loop; ``open`` is called before it runs.
     """
@@ -117,6 +125,7 @@ class Link:
         lag: ArrivalLag | None = None,
         known_peers: KnownPeers | None = None,
         newcomers: Newcomers | None = None,
+        receivers_s: Budget | None = None,
     ) -> None:
         self.url = url
         self.status = LinkStatus(url=str(url))
@@ -132,6 +141,7 @@ class Link:
         self._rejections = Budget(per_s=REJECTED_PER_S, most=REJECTED_PER_S)
         self._refused_ns = 0
         self._receiver_s = Budget(per_s=RECEIVER_SHARE, most=RECEIVER_SAVED_S)
+        self._receivers_s = receivers_s or receivers_budget()
         self._skipped = 0  # messages of receivers not reported yet
         self._skipped_ns = 0
         self._peers = Peers(
@@ -217,7 +227,8 @@ class Link:
         spent_s = time.perf_counter() - began_s
         is_mixed = len(found) != 1 or isinstance(found[0], Rejection)
         if receiver is not None:
-            self._receiver_s.charge(time.thread_time() - began_cpu_s)
+            for budget in (self._receiver_s, self._receivers_s):
+                budget.charge(time.thread_time() - began_cpu_s)
         elif is_mixed and not splitter.has_more:
             spent_s *= _share_of_frames(found, len(data))
         self._charge(peer, used, spent_s / max(1, len(found)))
@@ -246,7 +257,8 @@ class Link:
         Then a datagram is dropped whole, and counts as one message. Of a stream, the messages are
         passed over one by one: the place of the next one is known only then.
         """
-        has_time = self._receiver_s.spend(0.0, t_ns * 1e-9)
+        now_s = t_ns * 1e-9
+        has_time = self._receiver_s.has(0.0, now_s) and self._receivers_s.has(0.0, now_s)
         receiver.skips = not has_time or self._newcomers.is_dropped(receiver.sender, t_ns)
         if receiver.skips and self.url.listens:
             receiver.drop()

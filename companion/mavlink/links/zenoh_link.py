@@ -18,7 +18,6 @@ import asyncio
 from collections.abc import Collection, Hashable
 from typing import Final
 
-from companion.mavlink.links.daemon_threads import in_daemon_thread
 from companion.mavlink.links.endpoints import Upcalls
 from companion.mavlink.links.urls import LinkUrl
 from companion.mavlink.links.zenoh_bus import Bus, check
@@ -63,7 +62,7 @@ class ZenohLink:
 
         try:
             async with asyncio.timeout(OPEN_S):
-                await in_daemon_thread(bus.open)
+                await asyncio.to_thread(bus.open)
             bus.subscribe(self._heard_key, self._take)
             bus.neighbours(joined)
             self._bus = bus
@@ -75,7 +74,10 @@ class ZenohLink:
             raise OSError(str(error)) from error
         finally:
             self._bus = None
-            await in_daemon_thread(bus.close, at_once=True)
+            try:
+                await asyncio.to_thread(bus.close)
+            except RuntimeError:  # the system allows no more threads
+                bus.close()
 
     def peers(self) -> Collection[Hashable]:
         """Return the one peer, None, while there is a subscriber to this link's key."""

@@ -55,6 +55,7 @@ _Dated = tuple[int, _T]  # when it was true, and the value
 @dataclass(slots=True, kw_only=True)
 class _RelayedAircraft:
     news_ns: int = 0
+    moved_ns: int = 0  # newest message by which it moves
     position_ns: int | None = None  # when the newest reported position was true
     datum: AltitudeDatum | None = None
     altitudes: dict[AltitudeDatum, _Dated[float]] = field(default_factory=dict)
@@ -74,6 +75,9 @@ class _RelayedAircraft:
 
     def learn(self, message: AdsbVehicle, true_ns: int) -> None:
         """Store every field of a message that is present and newer than the stored one."""
+        velocity_mps = message.velocity_ne_mps or (0.0, 0.0)
+        if math.hypot(*velocity_mps, message.velocity_down_mps or 0.0) > HOVERING_MPS:
+            self.moved_ns = message.t_ns
         if message.alt_datum is not None:
             altitude = _newest(self.altitudes.get(message.alt_datum), true_ns, message.alt_m)
             if altitude is not None:
@@ -94,11 +98,11 @@ class _RelayedAircraft:
         return None if is_later and message.t_ns - before.t_ns > repeated_ns else before
 
     def _hovers(self, message: AdsbVehicle) -> bool:
-        """Return whether the aircraft states that it hovers, where it was reported last.
+        """Return whether the aircraft states that it hovers, and lately nothing else.
 
         A relay that lags still says so when others have reported that it flies on.
         """
-        if message.position_deg is None or not self.reported.is_newest(message.position_deg):
+        if message.t_ns - self.moved_ns <= HOVERING_NS:
             return False
         velocity_mps = _fitting(message.velocity_ne_mps, self.velocity_ne, message.true_ns)
         down_mps = _fitting(message.velocity_down_mps, self.velocity_down, message.true_ns) or 0.0

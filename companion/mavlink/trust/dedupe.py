@@ -15,9 +15,11 @@ WINDOW_NS: Final = 30_000_000_000
 """How long a report is remembered: longer than the largest lag observed between links."""
 LINKS_MAX: Final = 4096  # most links counted; a log may name one for each of its frames
 LATENCIES_KEPT: Final = 256  # newest latencies kept per link
-LATENCY_KEPT_NS: Final = 10_000_000_000
-"""How long the latency of a system's newest report tells how late its other messages are."""
-OVERDUE_INTERVALS: Final = 2  # intervals between reports after which the next one is overdue
+LATE_KEPT_NS: Final = 30_000_000_000
+"""How long the newest report of a system tells how late its other messages are."""
+LATE_MAX_NS: Final = 10_000_000_000  # longest time by which a report counts as overdue
+SLOT_NS: Final = 5_000_000_000
+"""The newest one to two of these times are searched for the largest age and the least interval."""
 
 
 @dataclass(slots=True)
@@ -34,13 +36,33 @@ class LinkShare:
 
 @dataclass(slots=True, kw_only=True)
 class _First:
-    """First arrival of a report; its latency is None until known, and at most ``age_s``."""
+    """First arrival of a report; its latency is None until known.
+
+    ``doubt_s`` is how much larger it may be.
+    """
 
     t_ns: int
     link: str
     sysid: int
     latency_s: float | None = None
-    age_s: float = 0.0
+    doubt_s: float = 0.0
+
+
+@dataclass(slots=True, kw_only=True)
+class _Lateness:
+    """How late the reports of one system over one link may be, in this slot and the one before.
+
+    first_ns     newest arrival of a report that had not arrived before
+    latencies_s  largest latencies
+    doubt_s      how much larger the newest one may be
+    intervals_ns least intervals between such arrivals
+    """
+
+    since_ns: int
+    first_ns: int
+    latencies_s: tuple[float, float]
+    doubt_s: float
+    intervals_ns: tuple[int, int] = LATE_KEPT_NS, LATE_KEPT_NS
 
 
 class Dedupe:
@@ -50,8 +72,7 @@ class Dedupe:
         self.shares: dict[str, LinkShare] = {}
         self._seen: OrderedDict[bytes, _First] = OrderedDict()  # in order of arrival
         self._newest: _First | None = None  # of these
-        self._latest: dict[tuple[str, int], tuple[int, float, int]] = {}
-        """Arrival, age and interval of the newest report, by link and system."""
+        self._lateness: dict[tuple[str, int], _Lateness] = {}  # by link and system
 
     def is_repeat(self, frame: Frame) -> bool:
         """Count a frame; return True if the same content arrived before it, within the window."""
@@ -67,37 +88,55 @@ class Dedupe:
             return False
         share.repeats += 1
         if first.latency_s is not None:
-            repeated_s = (t_ns - first.t_ns) * 1e-9
-            share.latencies_s.append(first.latency_s + repeated_s)
-            self._note((frame.link, first.sysid), t_ns, first.age_s + repeated_s)
+            latency_s = first.latency_s + (t_ns - first.t_ns) * 1e-9
+            share.latencies_s.append(latency_s)
+            self._note((frame.link, first.sysid), t_ns, latency_s, first.doubt_s, is_first=False)
         return True
 
     def set_latency(self, latency_s: float, age_s: float) -> None:
         """Set the likely and the largest latency, in seconds, of the last new report."""
         first = self._newest
         assert first is not None
-        first.latency_s, first.age_s = latency_s, age_s
+        first.latency_s, first.doubt_s = latency_s, age_s - latency_s
         self._share(first.link).latencies_s.append(latency_s)
-        self._note((first.link, first.sysid), first.t_ns, age_s)
+        self._note((first.link, first.sysid), first.t_ns, latency_s, first.doubt_s, is_first=True)
 
     def late_s(self, frame: Frame) -> float:
         """Return how late a frame of another message may be, by the reports of its system.
 
-        The newest one over the same link may be as late. If the next one is overdue, all that comes
-        may be late by that time. 0 if there was none in the last ``LATENCY_KEPT_NS``.
+        It may be as late as any of the last seconds over the same link, which may have several
+        peers. While the next report is overdue, it may be late by that time too. 0 if there was
+        no report in the last ``LATE_KEPT_NS``.
         """
-        newest = self._latest.get((frame.link, frame.source.sysid))
-        if newest is None or frame.t_ns - newest[0] > LATENCY_KEPT_NS:
+        known = self._lateness.get((frame.link, frame.source.sysid))
+        if known is None or frame.t_ns - known.first_ns > LATE_KEPT_NS:
             return 0.0
-        t_ns, age_s, interval_ns = newest
-        overdue_ns = frame.t_ns - t_ns - OVERDUE_INTERVALS * interval_ns
-        return max(age_s, age_s + overdue_ns * 1e-9)
+        overdue_ns = frame.t_ns - known.first_ns - min(known.intervals_ns)
+        overdue_s = min(max(0, overdue_ns), LATE_MAX_NS) * 1e-9
+        return max(known.latencies_s) + known.doubt_s + overdue_s
 
-    def _note(self, of: tuple[str, int], t_ns: int, age_s: float) -> None:
-        before = self._latest.get(of)
-        if before is not None or len(self._latest) < LINKS_MAX:
-            interval_ns = LATENCY_KEPT_NS if before is None else t_ns - before[0]
-            self._latest[of] = t_ns, age_s, interval_ns
+    def _note(
+        self, of: tuple[str, int], t_ns: int, latency_s: float, doubt_s: float, *, is_first: bool
+    ) -> None:
+        """Note the latency of a report. Short expressions stand for calls: this runs for each."""
+        known = self._lateness.get(of)
+        if known is None:
+            if len(self._lateness) < LINKS_MAX:
+                self._lateness[of] = _Lateness(
+                    since_ns=t_ns, first_ns=t_ns, latencies_s=(latency_s, 0.0), doubt_s=doubt_s
+                )
+            return
+        known.doubt_s = doubt_s
+        if t_ns - known.since_ns > SLOT_NS:
+            known.since_ns = t_ns
+            known.latencies_s = latency_s, known.latencies_s[0]
+            known.intervals_ns = LATE_KEPT_NS, known.intervals_ns[0]
+        elif latency_s > known.latencies_s[0]:
+            known.latencies_s = latency_s, known.latencies_s[1]
+        if is_first:
+            interval_ns, known.first_ns = t_ns - known.first_ns, t_ns
+            if interval_ns < known.intervals_ns[0]:
+                known.intervals_ns = interval_ns, known.intervals_ns[1]
 
     def _share(self, link: str) -> LinkShare:
         share = self.shares.get(link)

@@ -53,10 +53,6 @@ class ReportedPositions:
             velocity_down_mps=None if math.isnan(down) else down,
         )
 
-    def is_newest(self, at_deg: tuple[float, float]) -> bool:
-        """Return whether a position is the one that was reported last."""
-        return next(reversed(self._packed), None) == self._PLACE.pack(*at_deg)
-
     def put(self, at_deg: tuple[float, float], message: AdsbVehicle) -> None:
         """Store a message under its position, and drop the oldest position beyond the limit."""
         velocity_ne_mps, down_mps = message.velocity_ne_mps, message.velocity_down_mps

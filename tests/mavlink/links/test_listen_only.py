@@ -9,6 +9,7 @@ import json
 import socket
 from collections.abc import AsyncIterator, Callable
 from datetime import UTC, datetime
+from functools import partial
 from itertools import count
 from typing import cast
 
@@ -87,6 +88,29 @@ def test_receiver_beyond_its_share_of_the_time_is_skipped_and_counted(
             assert len(inbox.frames) == 9
             assert sum(one.count for one in inbox.rejections) == 28
             assert link.status.lost == {Reason.TOO_FREQUENT: 28}
+
+    run(test())
+
+
+def test_receivers_share_a_budget(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six servers of large documents, each within its share: no beams in 6 of 9 looks."""
+    monkeypatch.setattr(transport, "RECEIVERS_SAVED_S", 0.0)
+    budget = transport.receivers_budget()
+    clock = Seconds(1_000_000_000)
+
+    async def test() -> None:
+        shared = partial(running, "cot:udp:127.0.0.1:0", now_ns=clock.now_ns, receivers_s=budget)
+        async with shared() as (one, first), shared() as (other, second):
+            for link in (one, other):
+                await until_true(lambda link=link: link.status.state == "up")
+                link._newcomers.adapts_ns = 1 << 62
+            one.take(("127.0.0.1", 1), 8 * EVENT)
+            other.take(("127.0.0.1", 1), EVENT)
+            assert (len(first.frames), len(second.frames)) == (8, 0)
+            assert other.status.lost == {Reason.TOO_FREQUENT: 1}
+            clock.t_ns += 60_000_000_000
+            other.take(("127.0.0.1", 1), EVENT)
+            assert len(second.frames) == 1
 
     run(test())
 

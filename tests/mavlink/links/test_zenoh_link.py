@@ -2,13 +2,13 @@
 
 import asyncio
 import sys
-import threading
+from collections.abc import Callable
 
 import pytest
 from link_support import LOOPS, Run, frame, runner, running, until_true
 from support import free_port
 
-from companion.mavlink.links import daemon_threads, zenoh_link
+from companion.mavlink.links import zenoh_link
 from companion.mavlink.links.kinds import FRAMES_AT_ONCE
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import parse_link
@@ -55,23 +55,22 @@ def test_frames_pass_both_ways(run: Run, links: tuple[str, str]) -> None:
 def test_link_that_finds_no_thread_is_opened_again(
     run: Run, links: tuple[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A limit of processes that passes."""
-    start, refused = threading.Thread.start, list[str]()
+    """A limit of processes: to open and to close a session, each once."""
+    in_thread, refused = asyncio.to_thread, list[str]()
 
-    def third(thread: threading.Thread) -> None:
-        if thread.name == "background" and len(refused) < 2:
-            refused.append(thread.name)
+    async def third(work: Callable[[], None]) -> None:
+        if len(refused) < 2:
+            refused.append(work.__name__)
             raise RuntimeError("can't start new thread")
-        start(thread)
+        await in_thread(work)
 
     async def test() -> None:
         async with running(links[0]) as (hub, _):
             await until_true(lambda: hub.status.state == "up")
 
-    monkeypatch.setattr(daemon_threads, "THREAD_RETRY_S", 0.0)
-    monkeypatch.setattr(threading.Thread, "start", third)
+    monkeypatch.setattr(asyncio, "to_thread", third)
     run(test())
-    assert len(refused) == 2
+    assert refused == ["open", "close"]
 
 
 def test_large_sample_is_processed_a_few_frames_at_a_time(run: Run, links: tuple[str, str]) -> None:

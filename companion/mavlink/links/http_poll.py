@@ -58,6 +58,8 @@ class HttpPoll:
             try:
                 async with asyncio.timeout(ANSWER_S):
                     body = await _get(self._url, self._lookup, self._secure)
+            except ssl.SSLCertVerificationError as error:  # a ValueError, too
+                raise OSError(f"its certificate is not valid: {error.verify_message}") from error
             except (ValueError, EOFError) as error:
                 raise OSError(f"malformed HTTP answer: {error}") from error
             if body != newest:

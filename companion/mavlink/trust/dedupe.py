@@ -19,7 +19,7 @@ LATE_KEPT_NS: Final = 30_000_000_000
 """How long the newest report of a system tells how late its other messages are."""
 LATE_MAX_NS: Final = 10_000_000_000  # longest time by which a report counts as overdue
 SLOT_NS: Final = 5_000_000_000
-"""The newest one to two of these times are searched for the largest age and the least interval."""
+"""The newest one or two of these times have the largest latency and the least interval."""
 
 
 @dataclass(slots=True)
@@ -52,14 +52,14 @@ class _First:
 class _Lateness:
     """How late the reports of one system over one link may be, in this slot and the one before.
 
-    first_ns     newest arrival of a report that had not arrived before
+    newest_ns    newest arrival of a report, or of a repeat
     latencies_s  largest latencies
     doubt_s      how much larger the newest one may be
-    intervals_ns least intervals between such arrivals
+    intervals_ns least intervals between arrivals
     """
 
     since_ns: int
-    first_ns: int
+    newest_ns: int
     latencies_s: tuple[float, float]
     doubt_s: float
     intervals_ns: tuple[int, int] = LATE_KEPT_NS, LATE_KEPT_NS
@@ -90,7 +90,7 @@ class Dedupe:
         if first.latency_s is not None:
             latency_s = first.latency_s + (t_ns - first.t_ns) * 1e-9
             share.latencies_s.append(latency_s)
-            self._note((frame.link, first.sysid), t_ns, latency_s, first.doubt_s, is_first=False)
+            self._note((frame.link, first.sysid), t_ns, latency_s, first.doubt_s)
         return True
 
     def set_latency(self, latency_s: float, age_s: float) -> None:
@@ -99,7 +99,7 @@ class Dedupe:
         assert first is not None
         first.latency_s, first.doubt_s = latency_s, age_s - latency_s
         self._share(first.link).latencies_s.append(latency_s)
-        self._note((first.link, first.sysid), first.t_ns, latency_s, first.doubt_s, is_first=True)
+        self._note((first.link, first.sysid), first.t_ns, latency_s, first.doubt_s)
 
     def late_s(self, frame: Frame) -> float:
         """Return how late a frame of another message may be, by the reports of its system.
@@ -109,21 +109,19 @@ class Dedupe:
         no report in the last ``LATE_KEPT_NS``.
         """
         known = self._lateness.get((frame.link, frame.source.sysid))
-        if known is None or frame.t_ns - known.first_ns > LATE_KEPT_NS:
+        if known is None or frame.t_ns - known.newest_ns > LATE_KEPT_NS:
             return 0.0
-        overdue_ns = frame.t_ns - known.first_ns - min(known.intervals_ns)
+        overdue_ns = frame.t_ns - known.newest_ns - min(known.intervals_ns)
         overdue_s = min(max(0, overdue_ns), LATE_MAX_NS) * 1e-9
         return max(known.latencies_s) + known.doubt_s + overdue_s
 
-    def _note(
-        self, of: tuple[str, int], t_ns: int, latency_s: float, doubt_s: float, *, is_first: bool
-    ) -> None:
+    def _note(self, of: tuple[str, int], t_ns: int, latency_s: float, doubt_s: float) -> None:
         """Note the latency of a report. Short expressions stand for calls: this runs for each."""
         known = self._lateness.get(of)
         if known is None:
             if len(self._lateness) < LINKS_MAX:
                 self._lateness[of] = _Lateness(
-                    since_ns=t_ns, first_ns=t_ns, latencies_s=(latency_s, 0.0), doubt_s=doubt_s
+                    since_ns=t_ns, newest_ns=t_ns, latencies_s=(latency_s, 0.0), doubt_s=doubt_s
                 )
             return
         known.doubt_s = doubt_s
@@ -133,10 +131,9 @@ class Dedupe:
             known.intervals_ns = LATE_KEPT_NS, known.intervals_ns[0]
         elif latency_s > known.latencies_s[0]:
             known.latencies_s = latency_s, known.latencies_s[1]
-        if is_first:
-            interval_ns, known.first_ns = t_ns - known.first_ns, t_ns
-            if interval_ns < known.intervals_ns[0]:
-                known.intervals_ns = interval_ns, known.intervals_ns[1]
+        interval_ns, known.newest_ns = t_ns - known.newest_ns, t_ns
+        if interval_ns < known.intervals_ns[0]:
+            known.intervals_ns = interval_ns, known.intervals_ns[1]
 
     def _share(self, link: str) -> LinkShare:
         share = self.shares.get(link)

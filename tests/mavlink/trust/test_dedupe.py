@@ -136,6 +136,36 @@ def test_first_link_and_link_latencies_are_counted() -> None:
     assert list(b.latencies_s) == pytest.approx([0.14] * 100)
 
 
+def test_messages_over_a_link_that_only_repeats_are_as_late_as_its_repeats() -> None:
+    """For as long as it delivers them; while the next one is overdue, they may be later."""
+    dedupe = Dedupe()
+    for n in range(600):
+        t_ns = EPOCH_NS + n * S // 10
+        if not dedupe.is_repeat(sent(t_ns, "fast", boot_ms=n * 100)):
+            dedupe.set_latency(0.1, 0.3)
+        if n > 50:
+            assert dedupe.is_repeat(sent(t_ns, "slow", boot_ms=(n - 30) * 100))
+            assert dedupe.late_s(sent(t_ns, "slow")) == pytest.approx(3.1 + 0.2)
+        assert dedupe.late_s(sent(t_ns, "fast")) == pytest.approx(0.3)
+    assert dedupe.late_s(sent(t_ns + 2 * S, "fast")) == pytest.approx(0.3 + 1.9)
+    assert dedupe.late_s(sent(t_ns + 31 * S, "fast")) == 0.0
+
+
+def test_late_copy_beside_a_fast_one_makes_messages_as_late_for_seconds() -> None:
+    """Two radios on one link: the copies cannot be told apart."""
+    dedupe = Dedupe()
+    for n in range(200):
+        t_ns = EPOCH_NS + n * S // 10
+        if not dedupe.is_repeat(sent(t_ns, boot_ms=n * 100)):
+            dedupe.set_latency(0.1, 0.1)
+        if n == 100:
+            assert dedupe.is_repeat(sent(t_ns, boot_ms=(n - 40) * 100))
+        late_s = dedupe.late_s(sent(t_ns))
+        assert late_s == pytest.approx(4.1 if 100 <= n < 150 else late_s)
+        assert late_s == pytest.approx(0.1) or 100 <= n < 210
+    assert dedupe.late_s(sent(EPOCH_NS + 25 * S)) > 5.0, "overdue"
+
+
 def test_unknown_latency_is_not_recorded() -> None:
     dedupe = Dedupe()
     assert not dedupe.is_repeat(sent(EPOCH_NS))

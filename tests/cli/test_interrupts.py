@@ -80,6 +80,24 @@ def test_interrupt_is_never_a_traceback(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["companion", "sitl-replay"])
+def test_script_catches_no_signal_that_it_would_forget(name: str, tmp_path: Path) -> None:
+    """Of 3260 interrupts of a starting shell with a trap, 14 were lost as it was replaced."""
+    caught = tmp_path / "caught"
+    for program, text in (
+        ("env", f"grep SigCgt /proc/$PPID/status > {caught}\nexit 1\n"),
+        ("python", "exit 0\n"),
+    ):
+        (tmp_path / program).write_text(f"#!/bin/sh\n{text}")
+        (tmp_path / program).chmod(0o755)
+    shutil.copy(ROOT / "scripts" / name, tmp_path / name)
+    path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    subprocess.run(["/bin/sh", tmp_path / name], check=True, timeout=HANG_S, env=path)
+    signals = int(caught.read_text().split()[1], 16)
+    # The shell itself catches SIGINT: it ends at once.
+    assert not any(signals >> (number - 1) & 1 for number in (signal.SIGTERM, signal.SIGHUP))
+
+
+@pytest.mark.parametrize("name", ["companion", "sitl-replay"])
 def test_script_starts_python_with_interrupts_blocked(name: str, tmp_path: Path) -> None:
     """A starting interpreter would answer with a traceback; also by a link from elsewhere."""
     if HOLDS.returncode:

@@ -86,7 +86,7 @@ def filled(path: str) -> str:
 
 def crowded(uavs: int, directory: Path) -> StandIn:
     """Return a node with so many UAVs, each of them in every answer that there is."""
-    node = StandIn(settings(recording={"directory": str(directory)}))
+    node = StandIn(settings(recording={"directory": str(directory)}, tracks={"most": UAVS}))
     link = "udpin:127.0.0.1:14550"
     heard = dict[Source, ComponentStatus]()
     for number in range(3):

@@ -235,11 +235,12 @@ def test_sources_from_ever_new_peers_use_bounded_memory(monkeypatch: pytest.Monk
     heard = Heard()
     for n in range(2000):
         source = Source(2 + n // 250, 1 + n % 250)
-        heard.hear([n], "steady", t_ns=n).hear([5], f"new {n}", source, t_ns=n)
+        heard.hear([n], "steady", t_ns=n).hear([5], f"ever new {n}", source, t_ns=n)
         heard.farewells.clear()
         assert len(heard.status.components) <= 200
-        assert heard.peers.route_to(source) is heard.peers.find(f"new {n}")
-    assert sum(type(one) is Peer for one in gc.get_objects()) < 100
+        assert heard.peers.route_to(source) is heard.peers.find(f"ever new {n}")
+    kept = [one for one in gc.get_objects() if type(one) is Peer and str(one.key)[:8] == "ever new"]
+    assert len(kept) < 100
     assert heard.status.components[UAV].frames == 2000
     assert heard.hear([2000], "steady").peers.route_to(UAV) is heard.peers.find("steady")
     assert heard.counts == (0, 0, 0)

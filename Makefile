@@ -57,9 +57,10 @@ site: .venv/.dev
 bench: .venv/.dev
 	$(PYTEST) -q -s -m benchmark
 
-# Some 25 minutes. Floods and attacks run alone, all others two at a time, the longest first.
-SOAK_BESIDE = $(addprefix tests/,live/test_all_together.py pipeline/test_day.py \
-    server/test_contract.py live/test_recording.py mavlink/wire/test_framing_fuzz.py)
+# Some 25 minutes. Floods and attacks run alone, all others two at a time. Each worker takes two tests
+# at the start: a short one waits behind the longest.
+SOAK_BESIDE = $(addprefix tests/,live/test_all_together.py mavlink/wire/test_framing_fuzz.py \
+    pipeline/test_day.py server/test_contract.py live/test_recording.py)
 soak: .venv/.dev
 	failed=; \
 	$(PYTEST) -q -rP -n 2 --maxschedchunk 1 --durations 12 -m soak --timeout=0 $(SOAK_BESIDE) || failed=1; \

@@ -21,7 +21,7 @@ from companion.server.responses import PROBLEM_TYPE
 OPERATIONS = 26
 WITH_RULES = {"/v1/beams", "/v1/beams/weights", "/v1/pattern"}
 EXAMPLES = 12
-EXAMPLES_SOAK = 300
+EXAMPLES_SOAK = 150
 
 
 def check_every_operation(node: Any, examples: int) -> tuple[int, set[str]]:

@@ -58,7 +58,7 @@ bench: .venv/.dev
 	$(PYTEST) -q -s -m benchmark
 
 # Some 25 minutes. Floods and attacks run alone, all others two at a time. Each worker takes two tests
-# at the start: a short one waits behind the longest.
+# at the start, so that the first one of the second file waits for the longest: it must be short.
 SOAK_BESIDE = $(addprefix tests/,live/test_all_together.py mavlink/wire/test_framing_fuzz.py \
     pipeline/test_day.py server/test_contract.py live/test_recording.py)
 soak: .venv/.dev

@@ -1,6 +1,7 @@
 """Refuted assumptions, each with the setting that contains it.
 
-Each is reported once, and again after a minute, since a limit that was raised decays.
+Each is reported once. A limit that was raised decays, so that it may be refuted again: that is
+reported again after a minute.
 """
 
 import math

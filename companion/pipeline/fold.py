@@ -234,7 +234,8 @@ class Pipeline:
             same_as = self.targets.identities.observe(fix, tracks)
             if same_as is not None:
                 text = (
-                    f"{fix.uav}: taken for {same_as}, within the errors of both: no beam of its own"
+                    f"{fix.uav}: is where {same_as} is, within the errors of both, and counts as"
+                    " the same aircraft: it has no beam of its own"
                 )
                 said.append(
                     Notice(t_ns=fix.arrival_ns, severity=Severity.INFO, subject=fix.uav, text=text)

@@ -52,7 +52,7 @@ class UnusedRun:
 class UavRecord:
     """Record of a UAV, kept until it reboots or its track is dropped.
 
-    proven          of each refuted setting, when it was reported last, and its value
+    proven          by refuted setting: when it was reported last, ns, and with which value
     """
 
     refuted: int = 0  # how often assumptions about it were refuted

@@ -127,18 +127,19 @@ class SharedState:
     received    what this node itself received of its component, which is in force again once it
                 receives a report
     stamped_ns  arrival of the newest stamp that was shared
-    placed_ns   arrival of the newest position of each node, by its link
+    agreed_ns   arrival of each node's newest position that may be of the clock known here, by its
+                link
     """
 
     clock: SenderClock
     received: ComponentState
     stamped_ns: int
-    placed_ns: dict[str, int] = field(default_factory=dict)
+    agreed_ns: dict[str, int] = field(default_factory=dict)
 
     def brings_positions(self, link: str, t_ns: int) -> bool:
-        """Return whether positions of a node are used, so that its other messages are too."""
-        placed_ns = self.placed_ns.get(link)
-        return placed_ns is not None and t_ns - placed_ns <= BRINGS_NS
+        """Return whether a node lately shared positions, so that its other messages are used."""
+        agreed_ns = self.agreed_ns.get(link)
+        return agreed_ns is not None and t_ns - agreed_ns <= BRINGS_NS
 
 
 @dataclass(slots=True, kw_only=True)

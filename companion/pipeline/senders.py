@@ -263,7 +263,7 @@ class Senders:
     ) -> FrameOutcome:
         """Process a message other than positions: receiver, clock, vehicle or estimator status.
 
-        One that another node shares counts only while positions that it shares are used.
+        One that another node shares counts only while that node shares positions, too.
         """
         if type(message) is SystemTime:
             return self._system_time(frame, message)
@@ -472,7 +472,7 @@ class Senders:
             shared.stamped_ns = report.t_ns
             if not sender.agrees(report.t_ns, report.boot_ms):
                 return Reason.UNPLACED_STAMP, ()
-            shared.placed_ns[frame.link] = report.t_ns
+            shared.agreed_ns[frame.link] = report.t_ns
             return None, ()
         if shared is None:
             return None, ()

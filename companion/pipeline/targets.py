@@ -72,7 +72,10 @@ class Targets:
     # --- notices ----------------------------------------------------------------------------
 
     def changes(self, now_ns: int, states: Mapping[str, TrackState]) -> list[Notice]:
-        """Return notices for targets and the carrier whose state changed since the last call."""
+        """Note the states of targets and the carrier; return notices of those that changed.
+
+        Aircraft that were taken for one that is now too old for a beam are separated from it.
+        """
         changed = [uav for uav, state in states.items() if self._states.get(uav) is not state]
         elsewhere = (
             {} if self.duty is None else self._states

@@ -16,11 +16,12 @@ from support import BIN, HANG_S, shared_log
 from companion.beams.array.steering import steering_matrix
 from companion.cli.main import main
 from companion.mavlink.wire.framing import claimed_length
+from companion.node import replay as replay_module
 from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
 from companion.recording.reader import read_log
 from companion.settings.model import Settings
-from companion.values import Update
+from companion.values import Tick, Update
 
 
 def replay(*arguments: str | Path, check: bool = True) -> "subprocess.CompletedProcess[str]":
@@ -178,3 +179,18 @@ def test_log_that_begins_at_zero_has_a_duration(cut_log: Path, tmp_path: Path) -
         found.append(json.loads(done.stdout)["duration_s"])
     assert found[0] == pytest.approx(found[1])
     assert found[1] > 1
+
+
+def test_pause_of_a_century_is_slept_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording may state any time: the system refused to sleep that long, with a traceback."""
+    passed_s, slept = [0.0], list[float]()
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        passed_s[0] += 1e6 * seconds
+
+    monkeypatch.setattr(replay_module.time, "monotonic", lambda: passed_s[0])
+    monkeypatch.setattr(replay_module.time, "sleep", sleep)
+    events = [Tick(0), Tick(1 << 62)]
+    assert list(replay_module._paced(events, 0.1)) == events
+    assert len(slept) > 1 and max(slept) <= replay_module.SLEEP_S

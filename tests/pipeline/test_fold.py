@@ -818,8 +818,11 @@ def test_aircraft_that_is_taken_for_another_is_announced_once() -> None:
             place = (4000, 10.0 * n, -800)
         outputs = pipeline.step(position(t_s, "1:1", (3000, 10.0 * n, -800), (0, 20, 0)))
         outputs += pipeline.step(adsb(t_s, place, east_mps=20.0, tslc_s=0))
-        texts += [one.text for one in outputs if isinstance(one, Notice) and "taken" in one.text]
-    assert texts == ["icao:4CA7B3: taken for 1:1, within the errors of both: no beam of its own"]
+        texts += [one.text for one in outputs if isinstance(one, Notice) and "same" in one.text]
+    assert texts == [
+        "icao:4CA7B3: is where 1:1 is, within the errors of both, and counts as the same aircraft:"
+        " it has no beam of its own"
+    ]
 
 
 def test_track_restart_is_announced_once() -> None:

@@ -1,7 +1,7 @@
 """Connections to another machine: lookup of its name, and TCP to the first address that accepts.
 
-The event loop has few threads of its own for lookups. A name server that does not answer would
-keep them for half a minute each, and with them all other connections, and the end of the service.
+The event loop looks names up on a few threads. A name server that does not answer would occupy each
+for half a minute; meanwhile no other link could connect, and the service could not end.
 """
 
 import asyncio
@@ -31,7 +31,7 @@ class HostLookup:
     """
 
     def __init__(self, url: LinkUrl, kind: socket.SocketKind) -> None:
-        self.host = url.host
+        self._host = url.host
         self._port = url.port
         self._kind = kind
         self._pending: asyncio.Task[Found | OSError] | None = None
@@ -41,7 +41,7 @@ class HostLookup:
 
         Raises ``OSError`` if the name is unknown, or no name server answers in ``LOOKUP_S``.
         """
-        with contextlib.suppress(socket.gaierror):  # a name
+        with contextlib.suppress(socket.gaierror):  # raised for a name
             return self._look_up(socket.AI_NUMERICHOST)
         if self._pending is None:
             self._pending = asyncio.create_task(in_daemon_thread(self._attempt), name="lookup")
@@ -61,7 +61,7 @@ class HostLookup:
             return error
 
     def _look_up(self, flags: int) -> Found:
-        infos = socket.getaddrinfo(self.host, self._port, type=self._kind, flags=flags)
+        infos = socket.getaddrinfo(self._host, self._port, type=self._kind, flags=flags)
         return [(family, address) for family, _, _, _, address in infos]
 
 

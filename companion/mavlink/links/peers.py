@@ -66,7 +66,7 @@ class Splits(Protocol):
 class _Component:
     """One source over the whole link: its counts, and the peer over which it was last received.
 
-    The peer is None once it is forgotten.
+    The peer is None after it was forgotten, until the source is received again.
     """
 
     __slots__ = ("peer", "status")

@@ -55,7 +55,7 @@ _Dated = tuple[int, _T]  # when it was true, and the value
 @dataclass(slots=True, kw_only=True)
 class _RelayedAircraft:
     news_ns: int = 0
-    moved_ns: int = 0  # newest message by which it moves
+    moved_ns: int = 0  # arrival of the newest message that states that it moves
     position_ns: int | None = None  # when the newest reported position was true
     datum: AltitudeDatum | None = None
     altitudes: dict[AltitudeDatum, _Dated[float]] = field(default_factory=dict)

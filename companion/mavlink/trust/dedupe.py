@@ -104,9 +104,9 @@ class Dedupe:
     def late_s(self, frame: Frame) -> float:
         """Return how late a frame of another message may be, by the reports of its system.
 
-        It may be as late as any of the last seconds over the same link, which may have several
-        peers. While the next report is overdue, it may be late by that time too. 0 if there was
-        no report in the last ``LATE_KEPT_NS``.
+        It may be as late as any report of the last seconds over the same link: its peers are not
+        told apart. It may be later by the time for which the next report is overdue. 0 if there
+        was no report in the last ``LATE_KEPT_NS``.
         """
         known = self._lateness.get((frame.link, frame.source.sysid))
         if known is None or frame.t_ns - known.newest_ns > LATE_KEPT_NS:

@@ -185,7 +185,7 @@ class Drive:
         self._reported_state = ""  # whether beams are applied, or why not
         self.device_error: str | None = None  # why the device does not work
         self._is_failure_reported = False
-        self._works_since_ns = 0  # then, since when it has worked again
+        self._works_since_ns = 0  # since when a device has worked again whose failure was reported
         self.service_error: str | None = None  # why the service gives no beams
         self._took_ns: deque[int] = deque(maxlen=REMEMBERED)
         self._at_ns: deque[int] = deque(maxlen=REMEMBERED)
@@ -333,7 +333,7 @@ class Drive:
         return self._open
 
     def _note_success(self) -> None:
-        """Report a device that works again, and continues to.
+        """Note that the device accepted something; report a recovery once it has lasted.
 
         That it can be opened shows nothing: over UDP it may be absent.
         """

@@ -6,15 +6,21 @@ Every test runs on both loops.
 import asyncio
 import contextlib
 import json
+import shutil
 import socket
+import ssl
+import subprocess
+import threading
 from collections.abc import AsyncIterator, Callable
 from datetime import UTC, datetime
 from functools import partial
 from itertools import count
+from pathlib import Path
 from typing import cast
 
 import pytest
 from link_support import LIMIT_S, LOOPS, Run, port_of, runner, running, until_true
+from support import HANG_S
 
 from companion.mavlink.links import http_poll, transport
 from companion.mavlink.wire.encode import heartbeat
@@ -398,7 +404,9 @@ def test_web_server_without_valid_documents_is_announced(run: Run) -> None:
 
 
 @contextlib.asynccontextmanager
-async def polled(document: Callable[[], bytes]) -> AsyncIterator[str]:
+async def polled(
+    document: Callable[[], bytes], secure: ssl.SSLContext | None = None
+) -> AsyncIterator[str]:
     """Run a server of a document; yields its URL."""
 
     async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -408,8 +416,49 @@ async def polled(document: Callable[[], bytes]) -> AsyncIterator[str]:
             await writer.drain()
         writer.close()
 
-    async with await asyncio.start_server(answer, "127.0.0.1", 0) as server:
-        yield f"readsb:http://127.0.0.1:{server.sockets[0].getsockname()[1]}/aircraft.json"
+    way = "http" if secure is None else "https"
+    async with await asyncio.start_server(answer, "127.0.0.1", 0, ssl=secure) as server:
+        yield f"readsb:{way}://127.0.0.1:{server.sockets[0].getsockname()[1]}/aircraft.json"
+
+
+@pytest.mark.usefixtures("without_pauses")
+@pytest.mark.parametrize("is_trusted", [False, True])
+def test_certificates_are_checked_and_read_once(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_trusted: bool
+) -> None:
+    """Each request read those of the system on the event loop, for 40 ms."""
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not here")
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    made = f"openssl req -x509 -newkey rsa:2048 -nodes -keyout {key} -out {certificate} -days 2"
+    names = ["-subj", "/CN=receiver", "-addext", "subjectAltName=IP:127.0.0.1"]
+    subprocess.run([*made.split(), *names], check=True, capture_output=True, timeout=HANG_S)
+    secure = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    secure.load_cert_chain(certificate, key)
+    if is_trusted:
+        monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    made_on, make = list[str](), ssl.create_default_context
+
+    def create_default_context() -> ssl.SSLContext:
+        made_on.append(threading.current_thread().name)
+        return make()
+
+    monkeypatch.setattr(http_poll.ssl, "create_default_context", create_default_context)
+    numbers = count(100)
+
+    async def test() -> None:
+        document = polled(lambda: DOCUMENT % next(numbers), secure)
+        async with document as url, running(url) as (link, inbox):
+            if is_trusted:
+                await inbox.until(5)
+                assert not inbox.texts
+            else:
+                await inbox.until_said(1)
+                assert "its certificate is not valid: self-signed" in inbox.texts[0]
+                assert link.status.frames == 0
+
+    run(test())
+    assert made_on == ["background"]
 
 
 @pytest.mark.usefixtures("without_pauses")

@@ -3,7 +3,9 @@
 import asyncio
 import socket
 import ssl
+import threading
 from collections.abc import Collection, Hashable
+from functools import cache
 from typing import Final
 
 from companion.mavlink.links.connecting import HostLookup, connected
@@ -24,13 +26,27 @@ HEAD_MAX: Final = 16 << 10
 BODY_MAX: Final = DOCUMENT_MAX
 
 
+_making: Final = threading.Lock()
+
+
+def _shared_context() -> ssl.SSLContext:
+    """Return the TLS context of all links; the first call takes 40 ms, others wait for it."""
+    with _making:
+        return _context()
+
+
+@cache
+def _context() -> ssl.SSLContext:
+    return ssl.create_default_context()
+
+
 class HttpPoll:
     """Link that polls one document of one server, its only peer."""
 
     def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
         self._url = url
         self._lookup = HostLookup(url, socket.SOCK_STREAM)
-        self._secure: ssl.SSLContext | None = None  # made once, on a thread: it takes 40 ms
+        self._secure: ssl.SSLContext | None = None  # None until made, or without TLS
         self._upcalls = upcalls
         self._unchanged = b""  # last document of a receiver that has stopped; else empty
 
@@ -50,7 +66,7 @@ class HttpPoll:
     async def _poll(self) -> None:
         loop = asyncio.get_running_loop()
         if self._url.way == "https" and self._secure is None:
-            self._secure = await in_daemon_thread(ssl.create_default_context)
+            self._secure = await in_daemon_thread(_shared_context)
         is_up, newest, changed_s = False, self._unchanged, loop.time()
         while True:
             due_s = loop.time() + PERIOD_S

@@ -444,11 +444,12 @@ def test_certificates_are_checked_and_read_once(
         return make()
 
     monkeypatch.setattr(http_poll.ssl, "create_default_context", create_default_context)
+    http_poll._context.cache_clear()  # it is shared by all links
     numbers = count(100)
 
     async def test() -> None:
         document = polled(lambda: DOCUMENT % next(numbers), secure)
-        async with document as url, running(url) as (link, inbox):
+        async with document as url, running(url) as (link, inbox), running(url):
             if is_trusted:
                 await inbox.until(5)
                 assert not inbox.texts
@@ -459,6 +460,7 @@ def test_certificates_are_checked_and_read_once(
 
     run(test())
     assert made_on == ["background"]
+    http_poll._context.cache_clear()
 
 
 @pytest.mark.usefixtures("without_pauses")

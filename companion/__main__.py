@@ -1,6 +1,11 @@
 """Entry point of the console command ``companion``, and of ``python -m companion``."""
 
-from companion.cli.interrupts import interrupts_end, name_process, open_missing_streams
+from companion.cli.interrupts import (
+    interrupts_end,
+    name_process,
+    open_missing_streams,
+    threads_abandoned,
+)
 
 
 def main() -> None:
@@ -10,7 +15,8 @@ def main() -> None:
         name_process("companion")
         from companion.cli.main import main as command
 
-        command(prog_name="companion")
+        with threads_abandoned():
+            command(prog_name="companion")
 
 
 if __name__ == "__main__":

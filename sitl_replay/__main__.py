@@ -1,6 +1,11 @@
 """Entry point of the console command ``sitl-replay``, and of ``python -m sitl_replay``."""
 
-from companion.cli.interrupts import interrupts_end, name_process, open_missing_streams
+from companion.cli.interrupts import (
+    interrupts_end,
+    name_process,
+    open_missing_streams,
+    threads_abandoned,
+)
 
 
 def main() -> None:
@@ -10,7 +15,8 @@ def main() -> None:
         name_process("sitl-replay")
         from sitl_replay.cli import main as command
 
-        command(prog_name="sitl-replay")
+        with threads_abandoned():
+            command(prog_name="sitl-replay")
 
 
 if __name__ == "__main__":

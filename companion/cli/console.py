@@ -5,6 +5,7 @@ import math
 import os
 import shutil
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -14,7 +15,7 @@ from typing import Any, Final, NoReturn
 
 import click
 
-from companion.cli.interrupts import INTERRUPTED, command_ended, interrupts_raised
+from companion.cli.interrupts import INTERRUPTED, LAST_S, command_ended, interrupts_raised
 from companion.values import UserError, printable, shown
 
 TOKEN: Final = "COMPANION_TOKEN"
@@ -200,7 +201,15 @@ class OneLineErrors(click.Group):
         command_ended()
         line = " ".join(said.split())
         cut = line if len(line) <= ERROR_MAX else f"{line[:ERROR_MAX]}…"
-        say(f"{self.name}: {cut}", err=True)
+
+        def print_line() -> None:
+            with suppress(OSError):  # its reader has ended
+                say(f"{self.name}: {cut}", err=True)
+
+        # If nobody reads, the process ends without it: see ``threads_abandoned``.
+        printing = threading.Thread(target=print_line, name="last-line")
+        printing.start()
+        printing.join(LAST_S)
         sys.exit(status)
 
 

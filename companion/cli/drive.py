@@ -1,8 +1,6 @@
 """The command ``companion drive``: apply the beams of a running service to a device."""
 
-import contextlib
 import json
-import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -83,7 +81,7 @@ def drive(
     from companion.node.drive import running, targets
     from companion.node.drive.loop import Drive, SafeState
     from companion.node.drive.sources import BeamRequest, HttpSource, stored_registers
-    from companion.node.printing import STDERR, STDOUT, Printer
+    from companion.node.printing import STDERR, STDOUT, Printer, prints_unblocked
     from companion.pipeline import assembly
     from companion.settings.files import load
 
@@ -124,10 +122,8 @@ def drive(
             output.require_output()
             output.line(json.dumps(asdict(final_status)))
 
-    # What the library of a device prints is no JSON.
-    kept_apart = contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext()
     try:
-        with kept_apart:
+        with prints_unblocked():
             interrupted = running.run_until_stopped(driven, show, seconds)
         final_status = driven.status()
         lines.line(_text(final_status))

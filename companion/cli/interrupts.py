@@ -6,6 +6,7 @@ them itself (``companion.node.serving``), and ends with the status 0.
 
 import atexit
 import os
+import select
 import signal
 import sys
 import threading
@@ -19,6 +20,7 @@ from typing import Final
 from companion.node.signals import ENDS
 
 INTERRUPTED: Final = 130  # exit status
+LAST_S: Final = 1.0  # longest wait for who reads the last line, seconds
 RETRY_S: Final = 0.02  # delay before an interrupt that could not be raised is tried again
 IMPORTS_S: Final = 3.0
 """Time after which running imports no longer delay an interrupt: a busy machine takes far longer.
@@ -48,7 +50,8 @@ def interrupts_end(name: str) -> Iterator[None]:
     def end(_number: int, _frame: object) -> None:
         if _has_ended.is_set():
             return
-        os.write(2, f"{name}: interrupted\n".encode())
+        if select.select((), (2,), (), LAST_S)[1]:  # if somebody reads
+            os.write(2, f"{name}: interrupted\n".encode())
         os._exit(INTERRUPTED)
 
     for number in ENDS:
@@ -60,6 +63,24 @@ def interrupts_end(name: str) -> Iterator[None]:
     finally:
         for number in ENDS:
             signal.signal(number, end)
+
+
+@contextmanager
+def threads_abandoned() -> Iterator[None]:
+    """Context after which the process ends at once, also if threads still run.
+
+    The interpreter waits for all threads that are no daemons: for those of a device's library, and
+    for one that prints a line which nobody reads.
+    """
+    try:
+        yield
+    except SystemExit as end:
+        main = threading.main_thread()
+        if any(one is not main and not one.daemon for one in threading.enumerate()):
+            with suppress(OSError):
+                sys.stdout.flush()
+            os._exit(end.code if isinstance(end.code, int) else bool(end.code))
+        raise
 
 
 def open_missing_streams() -> None:

@@ -5,11 +5,14 @@ that would stop the beams.
 """
 
 import errno
+import io
 import os
 import select
 import shutil
 import threading
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Final
 
 from companion.values import printable
@@ -145,3 +148,33 @@ class Printer:
         except BlockingIOError:  # another process, which shares the pipe, set it to non-blocking
             select.select((), (self._descriptor,), ())
             return data
+
+
+class _Lines(io.TextIOBase):
+    """Text stream of which each line is printed by a ``Printer``."""
+
+    def __init__(self, printer: Printer) -> None:
+        self._printer = printer
+        self._begun = ""
+
+    def write(self, text: str, /) -> int:
+        """Print the lines that are complete, and keep the rest for the next call."""
+        *lines, begun = (self._begun + text).split("\n")
+        self._begun = begun[-WAITING_MAX:]
+        for line in lines:
+            self._printer.line(line)
+        return len(text)
+
+
+@contextmanager
+def prints_unblocked() -> Iterator[None]:
+    """Context in which what packages print goes to stderr, and waits for no reader.
+
+    These are the logs of the HTTP server and the event loop, and what the libraries of devices
+    print, which is no JSON either.
+    """
+    printer = Printer(STDERR)
+    lines = _Lines(printer)
+    with redirect_stderr(lines), redirect_stdout(lines):
+        yield
+    printer.finish()

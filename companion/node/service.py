@@ -191,7 +191,7 @@ class Service:
                 tasks.append(group.create_task(self._push.run(), name="records"))
                 if self._renewals is not None:
                     tasks.append(group.create_task(self._renewals.run(), name="renewals"))
-                tasks.append(group.create_task(self._run_drive(), name="drive"))
+                driving = group.create_task(self._run_drive(), name="drive")
                 if self.fleet is not None:
                     tasks.append(group.create_task(self.fleet.run(), name="fleet"))
                 tasks.append(group.create_task(self._recover_leftovers(), name="recovery"))
@@ -200,6 +200,7 @@ class Service:
                 serving = group.create_task(server.serve(sockets=[http]), name="http")
                 await until.wait()
                 server.should_exit = True
+                driving.cancel()  # a device may take as long to its safe state as HTTP to its end
                 await serving
                 for task in tasks:
                     task.cancel()

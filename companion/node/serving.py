@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import gc
+import logging
 import os
 import socket
 import sys
@@ -17,7 +18,7 @@ import uvicorn
 
 from companion.mavlink.links.daemon_threads import in_daemon_thread
 from companion.mavlink.links.descriptors import raise_limit
-from companion.node.printing import STDERR, Printer
+from companion.node.printing import STDERR, Printer, prints_unblocked
 from companion.node.signals import ENDS, interrupts_held, release_interrupts
 from companion.server.app import create_app
 from companion.server.connections import BoundedProtocol
@@ -75,6 +76,7 @@ class Server(uvicorn.Server):
             )
         )
         self._answering = answering
+        logging.getLogger("uvicorn.error").addFilter(_is_of_use)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to accept requests; see ``uvicorn.Server.startup``."""
@@ -85,6 +87,14 @@ class Server(uvicorn.Server):
     def capture_signals(self) -> Iterator[None]:
         """Install no signal handlers."""
         yield
+
+
+def _is_of_use(record: logging.LogRecord) -> bool:
+    """Return whether a line of the HTTP server's log is of use to the operator.
+
+    At the end the server reports how many clients did not read: they are not waited for.
+    """
+    return not record.msg.startswith("Cancel %s running task(s)")
 
 
 class RateMeter:
@@ -155,7 +165,11 @@ def run_until_stopped(
     _configure_interpreter()
     raise_limit()
     # Held until the loop has handlers: an exception would leave the loop half started.
-    with interrupts_held(), asyncio.Runner(loop_factory=_loop_factory()) as runner:
+    with (
+        prints_unblocked(),
+        interrupts_held(),
+        asyncio.Runner(loop_factory=_loop_factory()) as runner,
+    ):
         return runner.run(_stopped_by_signal(main, seconds))
 
 

@@ -27,7 +27,7 @@ from companion.values.aimed import (
 )
 from companion.values.caps import Cap, angle_rad, lens
 from companion.values.clock import ClockSet, UtcNs
-from companion.values.errors import UserError, printable, shown
+from companion.values.errors import UserError, printable, shown, text_of
 from companion.values.events import DUTY_MAX, Duty, Event, RoundTrip, Tick, Tock
 from companion.values.fleet import Offer, Shared, SharedFrame, Standing
 from companion.values.health import Blame, Cause, Level, Verdict
@@ -153,5 +153,6 @@ __all__ = [
     "reason_invalid",
     "roll_pitch_yaw_rad",
     "shown",
+    "text_of",
     "vector",
 ]

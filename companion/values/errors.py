@@ -24,3 +24,11 @@ def shown(given: object) -> str:
 def printable(text: str) -> str:
     """Remove control characters, such as terminal escapes, from a text; keep line breaks."""
     return "".join(char for char in text if char.isprintable() or char == "\n")
+
+
+def text_of(error: BaseException) -> str:
+    """Return the text of a package's exception; its type if it has none, or has a broken one."""
+    try:
+        return str(error) or type(error).__name__
+    except Exception:
+        return type(error).__name__

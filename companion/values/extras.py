@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from companion.values.errors import UserError
+from companion.values.errors import UserError, text_of
 
 
 @contextmanager
@@ -15,13 +15,14 @@ def needs(package: str, extra: str, what: str, library: str | None = None) -> It
     """
     try:
         yield
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise  # of the user
+    except BaseException as error:
         if isinstance(error, ModuleNotFoundError) and error.name == package:
             install = f"pip install 'uav-companion-beams[{extra}]'"
             raise UserError(f"{what} needs the package {package}: {install}") from error
         may_be_missing = library is not None and isinstance(error, OSError | AttributeError)
         raise UserError(
             f"{what} needs the package {package}, which does not load:"
-            f" {str(error) or type(error).__name__}"
-            + (f"; is {library} installed?" if may_be_missing else "")
+            f" {text_of(error)}" + (f"; is {library} installed?" if may_be_missing else "")
         ) from error

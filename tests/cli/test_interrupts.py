@@ -9,7 +9,6 @@ import sys
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -211,20 +210,6 @@ def test_nohup_keeps_a_service_from_ending_with_its_terminal() -> None:
             time.sleep(0.02)  # between two questions to another process
         process.send_signal(signal.SIGTERM)
         assert process.wait(HANG_S) == 0
-
-
-@pytest.fixture
-def full_pipe() -> Iterator[int]:
-    """The writing side of a pipe that takes nothing more, since its reader is stopped."""
-    read, write = os.pipe()
-    os.set_blocking(write, False)
-    with suppress(BlockingIOError):
-        while True:
-            os.write(write, bytes(4096))
-    os.set_blocking(write, True)
-    yield write
-    os.close(write)
-    os.close(read)
 
 
 def test_stopped_reader_of_the_status_stops_nothing(full_pipe: int) -> None:

@@ -384,9 +384,7 @@ class KnownPeers:
                 excess_m = known.path.excess_m(stranger.path, before, said)
                 self._judge(sender, name, stranger, excess_m, frame)
         worst_m = -math.inf  # against peers that were known earlier
-        for name, other in list(sender.known.items()):
-            if other is known:
-                continue
+        for name, other in _by_standing(sender, known):
             excess_m = _excess_m(known, other, before, said)
             is_later = _standing(known) < _standing(other)
             if is_later and not known.is_router:
@@ -395,7 +393,9 @@ class KnownPeers:
                 later = peer if is_later else name
                 if not sender.known[later].is_router:
                     self._demote(sender, later, frame)
-        return None if peer in sender.known and worst_m <= AGREEMENT_M else STRANGER
+                    if is_later:  # a stranger now, which judges no other peer
+                        return STRANGER
+        return None if worst_m <= AGREEMENT_M else STRANGER
 
     def _falls_behind(self, sender: _Sender, peer: str, known: _Peer, frame: Frame) -> bool:
         """Make a peer a stranger that became so late that its stamps look like another clock.
@@ -570,6 +570,12 @@ def _earlier(sender: _Sender, known: _Peer, now_ns: int) -> list[_Peer]:
         for one in sender.known.values()
         if _standing(one) > standing and now_ns - one.heard_ns <= REBOOT_NS
     ]
+
+
+def _by_standing(sender: _Sender, known: _Peer) -> list[tuple[str, _Peer]]:
+    """Return the other known peers by name, those that are believed over the rest first."""
+    others = [(name, one) for name, one in sender.known.items() if one is not known]
+    return sorted(others, key=lambda named: _standing(named[1]), reverse=True)
 
 
 def _current_earlier(sender: _Sender, known: _Peer, now_ns: int) -> list[_Peer]:

@@ -11,7 +11,14 @@ import contextlib
 from typing import Any, Final
 
 from companion.beams.hardware.devices import ADAR1000_CHANNELS, vector_modulator
-from companion.node.drive.loop import Device, DeviceCommand, DeviceInput, SafeState, library_errors
+from companion.node.drive.loop import (
+    Device,
+    DeviceCommand,
+    DeviceError,
+    DeviceInput,
+    SafeState,
+    library_errors,
+)
 from companion.values import IntArray, UserError
 from companion.values.extras import needs
 
@@ -62,7 +69,7 @@ class Chips(Device):
         """Close the SPI devices."""
         lines, self._lines = self._lines, []
         for line in lines:
-            with contextlib.suppress(Exception, SystemExit):  # an adapter that was unplugged
+            with contextlib.suppress(DeviceError), library_errors("SPI"):  # one that was unplugged
                 line.close()
 
     def _write(self, registers: IntArray) -> None:

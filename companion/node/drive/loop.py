@@ -20,7 +20,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from companion.values import IntArray, Severity, UserError, printable
+from companion.values import IntArray, Severity, UserError, printable, text_of
 
 REMEMBERED: Final = 1000  # updates whose times are kept
 LEAD_UPDATES: Final = 51  # updates whose median time is the next lead
@@ -56,13 +56,17 @@ class DeviceError(Exception):
 def library_errors(device: str) -> Iterator[None]:
     """Raise ``DeviceError`` for whatever the library of a device raises, and for its exits.
 
-    Libraries raise plain exceptions, and those of their own parsing of a reply.
+    Libraries raise plain exceptions, and those of their own parsing of a reply. On the main thread
+    ``KeyboardInterrupt`` is the user's.
     """
     try:
         yield
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
+        is_main = threading.current_thread() is threading.main_thread()
+        if is_main and isinstance(error, KeyboardInterrupt):
+            raise
         cause = error.strerror if isinstance(error, OSError) else None
-        raise DeviceError(f"{device}: {cause or str(error) or type(error).__name__}") from error
+        raise DeviceError(f"{device}: {cause or text_of(error)}") from error
 
 
 class SourceLostError(Exception):

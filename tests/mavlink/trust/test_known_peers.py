@@ -646,6 +646,45 @@ def test_vehicle_that_was_first_stays_believed(forged_hz: float, metres: float) 
             assert notices(peers, Disagreement.CONTRADICTS) == [("1:1", OTHER, (HOME,))]
 
 
+def test_known_peer_that_contradicts_two_others_is_a_stranger() -> None:
+    """It contradicts both at once, and judges neither, whichever was known first."""
+    third = "10.0.0.77:5"
+    peers = KnownPeers()
+    found = rejected(
+        peers,
+        heard(HOME, 10),
+        heard(OTHER, 10, begins_s=2.02),
+        heard(third, 10, begins_s=2.04, lasts_s=30.0),
+        heard(third, 10, begins_s=30.04, told=beside(60.0)),
+    )
+    assert found[HOME] == [] and max(found[OTHER]) < 20 < min(found[third][-200:])
+    assert len([t_s for t_s in found[third] if t_s > 30]) == 300
+
+
+@given(st.randoms(use_true_random=False), st.integers(2, 6))
+def test_peers_that_agree_and_contradict_in_any_order_are_judged(random: Any, count: int) -> None:
+    """Of a vehicle whose estimator resets its position, over radios of any latency and loss."""
+    latencies_s = [random.choice((0.02, 0.1, 0.6, 1.0)) for _ in range(count)]
+    off_m, streams = 0.0, list[Stream]()
+    for number in range(200):
+        if random.random() < 0.03:
+            off_m = random.choice((0.0, 5.0, 20.0, 100.0))
+        streams += [
+            heard(
+                f"10.0.0.{peer}:9",
+                5,
+                begins_s=number / 5,
+                lasts_s=(number + 1) / 5,
+                delay_s=lambda late_s=latencies_s[peer]: late_s + random.random() * 0.1,
+                told=beside(off_m),
+            )
+            for peer in range(count)
+            if random.random() < 0.8
+        ]
+    found = rejected(KnownPeers(), *streams)
+    assert set(found) <= {f"10.0.0.{peer}:9" for peer in range(count)}
+
+
 def test_fresh_ports_evict_no_known_peer_and_are_never_believed() -> None:
     """Each report comes from another port, near the true path and drifting away."""
     forged = (

@@ -10,6 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -39,6 +40,7 @@ from companion.node.drive.loop import (
     Drive,
     SafeState,
     SourceLostError,
+    library_errors,
 )
 from companion.node.drive.sources import (
     BeamRequest,
@@ -563,11 +565,17 @@ class Faulty:
         raise self._error
 
 
+class UnprintableError(Exception):
+    def __str__(self) -> str:
+        raise ValueError("no text")
+
+
 ERRORS: list[BaseException] = [
     OSError(5, "I/O error"), ValueError("could not convert string to float: '1.2.3'"),
     KeyError("rx_load_spi"), IndexError("list index out of range"), TypeError("NoneType"),
     UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"), AttributeError(),
     OverflowError("int too large"), Exception("Device not found!"), SystemExit(1),
+    GeneratorExit(), asyncio.CancelledError(), UnprintableError(),
 ]  # fmt: skip
 
 
@@ -601,6 +609,19 @@ def test_any_error_of_pyadi_iio_is_a_device_error(
     names = {name for _, name, _ in iio[written:]}
     assert ("beam_pos_load" if "memory" in target else "phase") in names
     assert drive.status().applied == 2 and device._phaser is not phaser  # type: ignore[attr-defined]
+
+
+def test_interrupt_that_a_library_raises_is_a_device_error_on_a_thread() -> None:
+    """On the main thread it is the user's."""
+
+    def raises() -> None:
+        with library_errors("SPI 0.0"):
+            raise KeyboardInterrupt
+
+    with ThreadPoolExecutor(1) as thread, pytest.raises(DeviceError, match=r"SPI 0\.0: Keyboard"):
+        thread.submit(raises).result(HANG_S)
+    with pytest.raises(KeyboardInterrupt):
+        raises()
 
 
 @pytest.mark.parametrize(
@@ -881,6 +902,8 @@ BROKEN = [
     ("import sys; sys.exit('no bus')", "no bus"),
     ("import missing_elsewhere", "No module named 'missing_elsewhere'"),
     ("def x(:", "invalid syntax"),
+    ("raise GeneratorExit", "GeneratorExit"),
+    ("class E(Exception):\n    def __str__(self): raise ValueError\nraise E", "E"),
 ]
 
 

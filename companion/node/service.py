@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import companion
-from companion.mavlink.links.daemon_threads import in_daemon_thread
+from companion.mavlink.links.daemon_threads import closed_within, in_daemon_thread
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.node.clock import NodeClock
@@ -218,7 +218,7 @@ class Service:
 
     async def _finish(self) -> None:
         if self._live:
-            await in_daemon_thread(self._live.stop, at_once=True)
+            await closed_within(self._live.stop)
         if self._recorder:
             stop = partial(self._recorder.stop, self.pipeline.digest.both())
             await saved_at_end(stop, "the recording", self._say, most_s=None)

@@ -9,6 +9,7 @@ from typing import Final, TypeVar
 
 T = TypeVar("T")
 
+CLOSED_S: Final = 1.0  # longest wait for what is closed at the end
 THREAD_RETRY_S: Final = 0.5  # time until a thread that could not be started is tried again
 
 
@@ -38,3 +39,15 @@ async def in_daemon_thread(work: Callable[[], T], *, at_once: bool = False) -> T
             await asyncio.sleep(THREAD_RETRY_S)
         else:
             return await done
+
+
+async def closed_within(close: Callable[[], None], most_s: float = CLOSED_S) -> None:
+    """Close something on a daemon thread, and wait for it, at most ``most_s`` seconds.
+
+    Servers of packages wait for their clients: one that sends nothing would delay the end for ever.
+    """
+    closing = asyncio.create_task(in_daemon_thread(close, at_once=True))
+    done, _ = await asyncio.wait([closing], timeout=most_s)
+    closing.cancel()
+    for task in done:
+        task.result()

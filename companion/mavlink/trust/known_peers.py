@@ -157,7 +157,11 @@ class _Peer:
 
     def brings_positions(self, now_ns: int) -> bool:
         """Return whether the peer may still bring positions."""
-        arrivals = (self.newest[msgid].t_ns for msgid in OWN if msgid in self.newest)
+        return self.brings(OWN, now_ns)
+
+    def brings(self, msgids: Collection[int], now_ns: int) -> bool:
+        """Return whether the peer may still bring one of these messages."""
+        arrivals = (self.newest[msgid].t_ns for msgid in msgids if msgid in self.newest)
         return now_ns - max(self.since_ns, *arrivals, 0) <= NO_POSITION_NS
 
     def hear(self, now_ns: int) -> None:
@@ -243,6 +247,7 @@ class KnownPeers:
             return None if agrees and read(frame).accuracy is None else STRANGER
         if msgid == ATTITUDE:
             self._compare_attitudes(sender, peer, frame, current)
+        self._note_attitudes(sender, peer, frame, current)
         self._note_no_fix(sender, peer, frame, current)
         return STRANGER
 
@@ -340,6 +345,18 @@ class KnownPeers:
             contradict(frame, one.newest[ATTITUDE]) for one in believed if ATTITUDE in one.newest
         ):
             self._note_contradiction(sender, peer, frame)
+
+    def _note_attitudes(
+        self, sender: _Sender, name: str, frame: Frame, believed: list[_Peer]
+    ) -> None:
+        """Publish that a stranger brings attitudes, of which those that are believed bring none.
+
+        They could turn the carrier's array, and nothing confirms them.
+        """
+        if frame.msgid == ATTITUDE and not any(
+            one.brings((ATTITUDE,), frame.t_ns) for one in believed
+        ):
+            self._notify(sender, Disagreement.HAS_ATTITUDES, name, frame)
 
     def _note_no_fix(self, sender: _Sender, name: str, frame: Frame, believed: list[_Peer]) -> None:
         """Publish that a peer states a lost fix, of which those that are believed bring nothing."""

@@ -14,6 +14,7 @@ class Disagreement(Enum):
     IS_NEWER = "messages from {peer} are newer than those from {known}, but not used"
     LEADS = "messages from {peer} arrive earlier than those from {known}, and set its clock"
     FALLS_BEHIND = "messages from {peer} arrive more than 10 s late; those from {known} are used"
+    HAS_ATTITUDES = "attitudes from {peer} are not used, although {known} sends none"
     HAS_NO_FIX = "{peer} reports no GNSS fix; not used, although {known} sends no GPS_RAW_INT"
 
 

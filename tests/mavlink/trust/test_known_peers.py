@@ -402,6 +402,22 @@ def test_stranger_of_another_clock_does_not_replace_a_peer_that_is_silent_for_se
     assert used[0] == pytest.approx(40.0, abs=0.3)
 
 
+@pytest.mark.parametrize("first_s", [5.5, 2.0, None])
+def test_attitudes_over_a_radio_without_positions_are_announced(first_s: float | None) -> None:
+    """Nor are they used: a carrier of which only a second radio brings them has no beams."""
+    peers = KnownPeers()
+    for number in range(200):
+        t_s = number / 10
+        place = report(round(t_s * S), 100 + t_s, circle(t_s))
+        assert peers.refusal(LINK, HOME, place) is None
+        if first_s is not None and t_s >= first_s:
+            assert peers.refusal(LINK, HOME, attitude(t_s, 0.5)) is None
+        assert peers.refusal(LINK, OTHER, attitude(t_s + 0.05, 0.5)) == STRANGER or number == 0
+    has_gap = first_s != 2.0
+    named = [("1:1", OTHER, (HOME,))] * has_gap
+    assert notices(peers, Disagreement.HAS_ATTITUDES) == named
+
+
 def test_stranger_that_sends_attitudes_alone_does_not_keep_the_vehicle_out() -> None:
     """Before its first position, and while it is silent for seconds. Nor are they used then."""
     peers = KnownPeers()

@@ -4,17 +4,19 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 from support import BIN, HANG_S, line_of, started
 
-RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0")
-UPGRADE = (
-    b"GET /v1/stream HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+ROTATOR = (
+    b"Min Azimuth: -180\nMax Azimuth: 180\nMin Elevation: 0\nMax Elevation: 90\n"
+    b"Azimuth: 5\nElevation: 6\nRPRT 0\n"
 )
+"""An answer of rotctld that holds what any request may ask for."""
+RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0")
 
 
 @pytest.mark.parametrize(
@@ -47,12 +49,12 @@ def test_interrupt_ends_a_command_that_loads(full_pipe: int) -> None:
         assert process.wait(HANG_S) == 130
 
 
-def test_client_that_does_not_close_its_websocket_delays_no_end(full_pipe: int) -> None:
+def test_client_that_does_not_read_delays_no_end(full_pipe: int) -> None:
     """The HTTP server logs at its end how many clients it has left."""
     command = [BIN / "companion", *RUN, "--center", "5:1"]
     with (
         started(command, stderr=full_pipe, stdout=subprocess.PIPE) as process,
-        websocket(line_of(process, process.stdout).decode()),
+        client_that_reads_nothing(line_of(process, process.stdout).decode()),
     ):
         process.terminate()
         assert process.wait(HANG_S) == 0
@@ -60,55 +62,51 @@ def test_client_that_does_not_close_its_websocket_delays_no_end(full_pipe: int) 
 
 def test_lines_of_the_http_server_about_its_clients_are_not_printed() -> None:
     command = [BIN / "companion", *RUN, "--center", "5:1"]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with started(command, **pipes) as process:
-        with websocket(line_of(process, process.stdout).decode()):
+    with started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        with client_that_reads_nothing(line_of(process, process.stdout).decode()):
             process.terminate()
             assert process.wait(HANG_S) == 0
         assert process.stderr.read() == b""
 
 
-def websocket(line: str) -> socket.socket:
-    """A client of the service that printed this line; it answers nothing."""
-    url = line.split()[2]
-    client = socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2])), HANG_S)
-    client.sendall(UPGRADE)
-    assert client.recv(12) == b"HTTP/1.1 101"
+def client_that_reads_nothing(line: str) -> socket.socket:
+    """A client of the service that printed this line, with a hundred answers to take."""
+    url, client = line.split()[2], socket.socket()
+    client.settimeout(HANG_S)
+    client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+    client.connect(("127.0.0.1", int(url.rpartition(":")[2])))
+    client.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 100)
+    assert client.recv(12, socket.MSG_PEEK) == b"HTTP/1.1 200"
     return client
 
 
-def test_device_goes_to_its_safe_state_while_clients_still_read(tmp_path: Path) -> None:
+def test_device_goes_to_its_safe_state_while_clients_are_waited_for(tmp_path: Path) -> None:
     """A device may take 4 s, and HTTP 2 s: one after the other, they would be too long."""
-    ended = list[str]()
     with socket.create_server(("127.0.0.1", 0)) as rotator:
         port = rotator.getsockname()[1]
         (tmp_path / "companion.toml").write_text(f'[drive]\ntarget = "rotctld:127.0.0.1:{port}"\n')
         command = [BIN / "companion", *RUN, "--center", "5:1", "--config", "companion.toml"]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
         with started(command, cwd=tmp_path, **pipes) as process:
-            client = websocket(line_of(process, process.stdout).decode())
+            line = line_of(process, process.stdout).decode()
             driven, _ = rotator.accept()
-            readers = [
-                threading.Thread(target=read_to_the_end, args=(one, name, ended))
-                for name, one in (("device", driven), ("client", client))
-            ]
-            for one in readers:
-                one.start()
-            process.terminate()
-            assert process.wait(HANG_S) == 0
-            for one in readers:
-                one.join(HANG_S)
-    assert ended == ["device", "client"]
+            with client_that_reads_nothing(line), ThreadPoolExecutor(1) as thread:
+                left_s = thread.submit(time_of_the_end_s, driven)
+                began_s = time.monotonic()
+                process.terminate()
+                assert process.wait(HANG_S) == 0
+                ended_s = time.monotonic()
+                device_s = left_s.result(HANG_S)
+    assert device_s - began_s < (ended_s - began_s) / 2
 
 
-def read_to_the_end(connection: socket.socket, name: str, ended: list[str]) -> None:
+def time_of_the_end_s(connection: socket.socket) -> float:
     """Answer each request of a rotator, until the service closes the connection."""
     connection.settimeout(HANG_S)
     with connection:
         while connection.recv(4096):
-            if name == "device":
-                connection.sendall(b"RPRT 0\n")
-    ended.append(name)
+            connection.sendall(ROTATOR)
+    return time.monotonic()
 
 
 @pytest.mark.parametrize(("ends", "status"), [("sys.exit(3)", 3), ("sys.exit()", 0)])

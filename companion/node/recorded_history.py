@@ -67,7 +67,8 @@ def main() -> None:
         os.nice(19)
     try:
         for line in lines(Path(sys.argv[1])):
-            sys.stdout.buffer.write(orjson.dumps(line, option=orjson.OPT_APPEND_NEWLINE))
+            options = orjson.OPT_APPEND_NEWLINE | orjson.OPT_SERIALIZE_NUMPY
+            sys.stdout.buffer.write(orjson.dumps(line, option=options))
             sys.stdout.buffer.flush()
     except (UserError, OSError, ValueError) as error:
         problem = {"problem": str(error)}

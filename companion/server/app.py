@@ -220,7 +220,7 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
     async def events() -> Response:
         return answer(glance.events(node))
 
-    histories = dict[bool, tuple[series.Sample | None, bytes]]()  # until the next sample
+    histories = dict[tuple[int, bool], bytes]()  # by the time of the newest sample
 
     @app.get(
         "/v1/history",
@@ -245,11 +245,14 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
 
             return make
 
-        newest, body = histories.get(rounded, (None, b""))
-        if newest is None or newest is not node.series.newest:
-            newest = node.series.newest
+        newest = node.series.newest
+        key = (0 if newest is None else newest[0]), rounded
+        body = histories.get(key)
+        if body is None or newest is None:
             body = await large.made(("history", rounded), prepare)
-            histories[rounded] = newest, body
+            for old in [one for one in histories if one[0] != key[0]]:  # megabytes each
+                del histories[old]
+            histories[key] = body
         return json_response(body)
 
     @app.get(

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Final
 
-BYTES_MAX: Final = 32 << 20  # bytes of all bodies being sent, each counted once; one larger is sent
+BYTES_MAX: Final = 16 << 20  # bytes of all bodies being sent, each counted once; one larger is sent
 
 
 class HeldBodies:

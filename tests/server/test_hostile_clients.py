@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import json
 import socket
 import time
 from collections.abc import AsyncIterator, Callable
@@ -20,6 +21,7 @@ from companion.beams.hardware import codebooks
 from companion.pipeline import assembly
 from companion.server import connections, work_slots
 from companion.server.app import create_app
+from companion.server.responses import encode
 from companion.server.work_slots import WorkSlots
 from companion.settings.model import Settings
 from companion.values import UserError, UtcNs
@@ -278,10 +280,11 @@ def test_history_is_limited_to_five_minutes(make_node: Any) -> None:
     assert [t_ns for t_ns, _ in samples] == [
         newest_ns - (SAMPLES - 1 - i) * 1_000_000_000 for i in range(SAMPLES)
     ]
-    shown = series.show(samples, newest_ns, UtcNs)
+    said = encode(series.show(samples, newest_ns, UtcNs))
     node.tick(1.0)
     kept.add(node.pipeline)  # the snapshot for another thread is unchanged
-    assert shown == series.show(samples, newest_ns, UtcNs)
+    assert said == encode(series.show(samples, newest_ns, UtcNs))
+    shown = json.loads(said)
     assert len(shown["at"]) == SAMPLES == 300
     columns = [column for uav in shown["uavs"].values() for column in uav.values()]
     assert columns and all(len(column) == SAMPLES for column in columns)

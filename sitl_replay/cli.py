@@ -16,7 +16,7 @@ from typing import Any
 import click
 
 from companion import __version__
-from companion.cli.console import OneLineErrors, bearer_token, print_truncated
+from companion.cli.console import OneLineErrors, bearer_token, print_last, print_truncated
 from companion.mavlink.links.regular_file import open_regular
 from companion.mavlink.links.urls import MAVLINK, LinkUrl, parse_link
 from companion.node.signals import ENDS, interrupts_held, release_interrupts
@@ -427,7 +427,7 @@ async def _progress(count: player.Tally | recorder.RecordingTally) -> None:
 def conclude(count: player.Tally | recorder.RecordingTally, done: str, as_json: bool) -> None:
     """Print the summary. Exit with status 1 if a link was lost during the run."""
     if as_json:
-        click.echo(json.dumps(summary_of(count)))
+        print_last(json.dumps(summary_of(count)))
     else:
         unusable = [f", {number} {why}" for why, number in count.rejected.items()]
         if isinstance(count, player.Tally) and count.dropped:
@@ -436,7 +436,7 @@ def conclude(count: player.Tally | recorder.RecordingTally, done: str, as_json: 
             unusable += [f", {name}: {number}" for name, number in count.faults.items()]
             unusable += [f", observations {name}: {n}" for name, n in count.observed.items()]
         sizes = f"{count.frames} frames, {count.octets} bytes in {count.duration_s:.1f} s"
-        click.echo(f"{done} {sizes}{''.join(unusable)}")
+        print_last(f"{done} {sizes}{''.join(unusable)}")
     if isinstance(count, player.Tally) and count.lost:
         sys.exit(1)
 

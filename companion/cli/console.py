@@ -91,6 +91,31 @@ def say(text: str, err: bool = False) -> None:
     click.echo(printable(text), err=err)
 
 
+def print_last(text: str, *, err: bool = False) -> None:
+    """Print the last line of a command, and wait ``LAST_S`` for who reads it.
+
+    If nobody does, the process ends without it: see ``threads_abandoned``. Raises ``OSError`` if
+    it cannot be written.
+    """
+    failed: list[OSError] = []
+
+    def write() -> None:
+        try:
+            say(text, err=err)
+        except OSError as error:
+            failed.append(error)
+
+    try:
+        writing = threading.Thread(target=write, name="last-line")
+        writing.start()
+    except RuntimeError:  # the system allows no more threads
+        write()
+    else:
+        writing.join(LAST_S)
+    if failed:
+        raise failed[0]
+
+
 def bearer_token() -> str | None:
     """Return the bearer token of the environment; a file of variables may add a line end to it.
 
@@ -202,14 +227,8 @@ class OneLineErrors(click.Group):
         line = " ".join(said.split())
         cut = line if len(line) <= ERROR_MAX else f"{line[:ERROR_MAX]}…"
 
-        def print_line() -> None:
-            with suppress(OSError):  # its reader has ended
-                say(f"{self.name}: {cut}", err=True)
-
-        # If nobody reads, the process ends without it: see ``threads_abandoned``.
-        printing = threading.Thread(target=print_line, name="last-line")
-        printing.start()
-        printing.join(LAST_S)
+        with suppress(OSError):  # its reader has ended
+            print_last(f"{self.name}: {cut}", err=True)
         sys.exit(status)
 
 

@@ -18,8 +18,9 @@ from typing import Final
 
 from companion.node.service import Service
 from companion.node.serving import pause
-from companion.values import TrackState, UserError
+from companion.values import TrackState, UserError, shown
 
+DIGITS_MAX: Final = 20  # most digits of a 64-bit number
 OPENING_S: Final = 1.0
 """Longest wait for links to open before the service reports that it is ready."""
 STATUS_EVERY_S: Final = 5.0
@@ -70,8 +71,8 @@ def _watchdog_s(environ: Mapping[str, str]) -> float | None:
     pid, usec = environ.get("WATCHDOG_PID"), environ.get("WATCHDOG_USEC")
     if usec is None or (pid is not None and pid != str(os.getpid())):
         return None  # not requested, or for another process
-    if not usec.isdecimal() or int(usec) == 0:
-        raise UserError(f"WATCHDOG_USEC: {usec!r} is not a positive number of microseconds")
+    if not (usec.isdecimal() and len(usec) <= DIGITS_MAX and int(usec)):
+        raise UserError(f"WATCHDOG_USEC: {shown(usec)} is not a positive number of microseconds")
     return int(usec) * 1e-6
 
 

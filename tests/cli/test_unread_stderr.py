@@ -1,4 +1,4 @@
-"""A stderr that nobody reads, and threads that never end: no command waits for either."""
+"""A stdout or stderr that nobody reads, and threads that never end: no command waits for them."""
 
 import signal
 import socket
@@ -32,6 +32,33 @@ RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0")
 def test_mistake_of_a_user_ends_the_command(words: tuple[str, ...], full_pipe: int) -> None:
     with started([BIN / "companion", *words], stderr=full_pipe, stdout=subprocess.PIPE) as process:
         assert process.wait(HANG_S) in (1, 2)
+
+
+def test_signal_ends_test_traffic_whose_summary_nobody_reads(full_pipe: int) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(HANG_S)
+        to = f"udpout:127.0.0.1:{receiver.getsockname()[1]}"
+        command = [BIN / "sitl-replay", "fly", "paper", "--to", to]
+        with started(command, stdout=full_pipe, stderr=subprocess.DEVNULL) as process:
+            assert receiver.recv(2000)
+            process.terminate()
+            assert process.wait(HANG_S) == 0
+
+
+def test_error_is_one_line_while_the_system_allows_no_more_threads() -> None:
+    code = (
+        "import threading\n"
+        'def refused(self): raise RuntimeError("can\'t start new thread")\n'
+        "threading.Thread.start = refused\n"
+        "from companion.cli.main import main\n"
+        "main(['replay', 'missing.tlog', '--center', '5:1'])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=HANG_S, check=False
+    )
+    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1
+    assert "missing.tlog" in done.stderr
 
 
 def test_interrupt_ends_a_command_that_loads(full_pipe: int) -> None:

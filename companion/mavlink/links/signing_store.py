@@ -266,6 +266,10 @@ def _kept(link: Mapping[str, Any]) -> _Kept:
         sent=_whole(link["sent"]),
         floor=_whole(link["floor"]),
         streams=streams,
+        paces={
+            (_whole(sysid), _whole(compid), _whole(link_id)): _whole(pace)
+            for sysid, compid, link_id, pace in link.get("paces", ())
+        },
     )
     return _Kept(state, bool(link["clean"]))
 
@@ -287,6 +291,7 @@ def _encoded(links: Mapping[_LinkKey, _Kept]) -> bytes:
             "sent": state.sent,
             "floor": state.floor,
             "streams": [[*stream, *heard] for stream, heard in state.streams.items()],
+            "paces": [[*stream, pace] for stream, pace in state.paces.items()],
         }
         for link, (state, clean) in links.items()
     ]

@@ -33,8 +33,11 @@ followed, because one frame could then exhaust all timestamps.
 
 **Memory.** At most ``STREAMS_MAX`` streams are remembered. A new stream replaces the one that has
 been silent for longest; from then on new streams must be newer than the forgotten one.
+
+Over 300 lines: what is accepted, and what must be remembered for it, depend on each other.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -64,6 +67,8 @@ FOLLOWED_MAX: Final = LATEST - 3650 * 24 * 60 * MINUTE
 """Largest received timestamp that the local one follows: ten years before ``LATEST``."""
 MARGIN: Final = 5 * SECOND
 """Largest lag of a killed process's state on disk: see ``State.after_crash``."""
+COUNTED_SHARE: Final = 0.1  # share of a clock's pace below which timestamps count frames
+PACED: Final = 10 * SECOND  # time over which the pace of a stream is measured
 BURST: Final = SECOND
 """Upper limit on frames sent in ``MARGIN``; each takes one time unit if the clock is behind."""
 
@@ -86,6 +91,8 @@ class State:
     streams: Mapping[Stream, ReceivedTimestamp] = field(
         default_factory=dict
     )  # newest timestamp of each stream
+    paces: Mapping[Stream, int] = field(default_factory=dict)
+    """Units per second by which timestamps advance that count frames; others follow a clock."""
 
     def after_crash(self) -> Self:
         """Return the state to resume with if the process ended up to ``MARGIN`` after saving.
@@ -95,17 +102,26 @@ class State:
         second. Lost frames of this node were stamped at most ``MARGIN`` ahead of the own clock, or
         of a sender's clock that is ahead of it. Streams that began in the lost time are unknown:
         new streams must be newer than anything this node could have sent. Repeated crashes do not
-        accumulate margins.
+        accumulate margins of clocks.
+
+        A sender may also count its frames from a time that it once received, as ArduPilot and
+        pymavlink do. It would reach a clock's margin after hours, so its stream advances by the
+        frames of ``MARGIN``.
 
         Not covered: frames accepted in the lost time from a sender whose clock jumped ahead just
-        then, that was new and ahead, or that was ahead and returned after a silence longer than
-        that.
+        then, that was new and ahead, that was ahead and returned after a silence longer than that,
+        or that sent more frames than it usually does; until its next frame.
         """
         sent = max(self.sent + BURST, max(self.local, self.clock) + MARGIN)
         streams: dict[Stream, ReceivedTimestamp] = {}
         for stream, (newest, lead) in self.streams.items():
             if lead is not None:
-                moved = max(newest, self.clock + lead + MARGIN)
+                pace = self.paces.get(stream)
+                if pace is None:
+                    moved = max(newest, self.clock + lead + MARGIN)
+                else:
+                    moved = newest + pace * MARGIN // SECOND
+                moved = min(moved, LATEST)
                 streams[stream] = (moved, lead)
                 if newest > self.clock:
                     sent = max(sent, min(moved, FOLLOWED_MAX))
@@ -117,10 +133,29 @@ class State:
             sent=sent,
             floor=max(self.floor, sent),
             streams=streams,
+            paces=self.paces,
         )
 
 
 START: Final = State()  # nothing received and nothing sent
+
+
+@dataclass(slots=True)
+class _Pace:
+    """Timestamp and own clock when the measurement of a stream's pace began, and the last pace.
+
+    That is None for timestamps that follow a clock.
+    """
+
+    stamp: int
+    clock: int
+    per_s: int | None = None
+
+    def measure(self, stamp: int, clock: int) -> None:
+        """End a measurement, and begin the next one."""
+        share = (stamp - self.stamp) / (clock - self.clock)
+        self.per_s = math.ceil(share * SECOND) if share < COUNTED_SHARE else None
+        self.stamp, self.clock = stamp, clock
 
 
 class NewestTimestamps:
@@ -182,6 +217,11 @@ class LinkSigning:
         self._sent = state.sent
         self._floor = state.floor
         self._streams = dict(state.streams)
+        self._paces = {
+            stream: _Pace(newest, newest - lead, state.paces.get(stream))
+            for stream, (newest, lead) in state.streams.items()
+            if lead is not None
+        }
         self._senders = NewestTimestamps() if senders is None else senders
         self._senders.note_all(state)
 
@@ -205,6 +245,11 @@ class LinkSigning:
         if not self._senders.note(stream, stamp):
             return Reason.REPLAYED
         self._remember(stream, (stamp, stamp - clock))
+        pace = self._paces.get(stream)
+        if pace is None:
+            self._paces[stream] = _Pace(stamp, clock)
+        elif clock - pace.clock >= PACED:
+            pace.measure(stamp, clock)
         self._local = max(self._local, min(stamp, FOLLOWED_MAX))
         return None
 
@@ -235,6 +280,9 @@ class LinkSigning:
             sent=self._sent,
             floor=self._floor,
             streams=dict(self._streams),
+            paces={
+                stream: pace.per_s for stream, pace in self._paces.items() if pace.per_s is not None
+            },
         )
 
     def ahead_ns(self, now_ns: int) -> int:
@@ -253,5 +301,6 @@ class LinkSigning:
         if streams.pop(stream, None) is None and len(streams) >= STREAMS_MAX:
             oldest = next(iter(streams))  # they are in the order of their newest frames
             self._floor = max(self._floor, streams.pop(oldest)[0])
+            self._paces.pop(oldest, None)
         streams[stream] = heard
         self.moves += 1

@@ -21,7 +21,8 @@ class MountLag:
     """Estimate of the lag of a mount from the times of commands and reports."""
 
     def __init__(self) -> None:
-        self.lag_s = 0.0
+        self._lag_s = 0.0
+        self._has_new = False  # whether reports have come since the last estimate
         self._commands: deque[tuple[float, float]] = deque(maxlen=2 * KEPT)
         self._reports: deque[tuple[float, float]] = deque(maxlen=KEPT)
 
@@ -30,10 +31,17 @@ class MountLag:
         self._commands.append((at_ns * 1e-9, azimuth_rad))
 
     def note_report(self, at_ns: int, azimuth_rad: float) -> None:
-        """Note a reported direction, and update the lag estimate."""
+        """Note a reported direction."""
         self._reports.append((at_ns * 1e-9, azimuth_rad))
-        if self._commands and len(self._reports) >= SAMPLES_MIN:
+        self._has_new = True
+
+    @property
+    def lag_s(self) -> float:
+        """Lag by the reports so far, estimated when it is read: that takes milliseconds."""
+        if self._has_new and self._commands and len(self._reports) >= SAMPLES_MIN:
+            self._has_new = False
             self._estimate(np.array(self._commands).T, np.array(self._reports).T)
+        return self._lag_s
 
     def _estimate(self, told: FloatArray, seen: FloatArray) -> None:
         late = seen[:, seen[0] >= told[0, 0] + MOST_S]
@@ -46,4 +54,4 @@ class MountLag:
         left = np.sqrt(np.mean(off**2, axis=1))
         best = int(np.argmin(left))
         if left[best] <= RESIDUAL_MAX * np.std(late[1]):
-            self.lag_s = float(lags[best])
+            self._lag_s = float(lags[best])

@@ -17,7 +17,7 @@ from support import HANG_S, line_of, started
 
 from companion.mavlink.links.signing_store import Timestamps, key_warning, load_key
 from companion.mavlink.links.urls import LinkError
-from companion.mavlink.trust.signing import EPOCH_NS, UNIT_NS, LinkSigning, fingerprint
+from companion.mavlink.trust.signing import EPOCH_NS, LATEST, UNIT_NS, LinkSigning, fingerprint
 from companion.mavlink.wire import encode
 from companion.mavlink.wire.framing import Splitter
 from companion.values import Frame, Reason, Source
@@ -344,6 +344,25 @@ def test_timestamps_are_saved_each_second_or_every_three_when_idle(path: Path) -
     timestamps.close(NOW_NS + 2 * S)
 
 
+def test_highest_timestamp_survives_repeated_kills(path: Path) -> None:
+    """It has no room for a margin. Paces of streams are kept, too."""
+    latest_ns, left = EPOCH_NS + LATEST * UNIT_NS, path
+    for number in range(3):
+        timestamps = Timestamps(left)
+        guard = timestamps.guard(URL, KEY, 0, NOW_NS)
+        if not number:
+            for second in range(0, 30, 2):
+                counted = sent(NOW_NS + second * UNIT_NS, sysid=2)
+                assert guard.refusal(counted._replace(t_ns=NOW_NS + second * S)) is None
+        refused = guard.refusal(sent(latest_ns)._replace(t_ns=NOW_NS))
+        assert refused is (Reason.REPLAYED if number else None)
+        snapshot = timestamps.snapshot(NOW_NS + S)
+        assert [one.state.paces for one in snapshot.links.values()] == [{(2, 1, 0): 1}]
+        timestamps.write(snapshot)
+        left = file_after_kill(left, f"left{number}")
+        timestamps.close(NOW_NS)
+
+
 def test_snapshot_never_replaces_a_newer_one(path: Path) -> None:
     timestamps = Timestamps(path)
     guard = timestamps.guard(URL, KEY, 0, NOW_NS)
@@ -487,11 +506,13 @@ def written(path: Path, links: object) -> None:
         [LINK | {"streams": None}],
         [LINK | {"streams": [[1, 1, 1]]}],
         [LINK | {"streams": [[1, 1, 1, "a", "b"]]}],
+        [LINK | {"paces": [[1, 1, 0]]}],
+        [LINK | {"paces": [[1, 1, 0, 0.5]]}],
         [LINK | {"clock": "x"}],
         [LINK | {"clock": 1.5}],
         [LINK | {"sent": 10**40}],
     ],
-    ids=range(10),
+    ids=range(12),
 )
 def test_wrong_content_with_the_right_digest_is_damage(path: Path, links: object) -> None:
     written(path, [LINK])

@@ -565,6 +565,40 @@ def test_crash_after_a_silent_stream_resumed(silent_s: int) -> None:
     assert run.hear((1, 1, 0), 0) is None
 
 
+@pytest.mark.parametrize("hz", [4, 50])
+@pytest.mark.parametrize("runs", [1, 3])
+def test_crash_while_a_sender_counts_its_frames(hz: int, runs: int) -> None:
+    """As ArduPilot and pymavlink do. A clock's margin would keep it out for hours."""
+    ours, number, frames = guard(), 0, list[Frame]()
+
+    def counted(at_s: float) -> Frame:
+        nonlocal number
+        number += 1
+        return sent(NOW + number, t_ns=NOW_NS + round(at_s * S))
+
+    at_s = 0.0
+    for _ in range(runs):
+        saved_s, until_s = at_s + 30, at_s + 33
+        while at_s < until_s:
+            if at_s < saved_s:
+                state = ours.state(NOW_NS + round(at_s * S))
+            frame = counted(at_s)
+            if ours.refusal(frame) is None:
+                frames.append(frame)
+            at_s += 1 / hz
+        ours = guard(state=state.after_crash())
+        assert {ours.refusal(one._replace(t_ns=NOW_NS + round(at_s * S))) for one in frames} == {
+            Reason.REPLAYED
+        }
+        late = [ours.refusal(counted(at_s + n / hz)) for n in range(6 * hz)]
+        assert late[-1] is None and late.count(Reason.REPLAYED) <= 5 * hz
+        at_s += 6
+    # A clock that follows again has a clock's margin again.
+    for n in range(20):
+        assert ours.refusal(sent(NOW + (n + 1000) * UNITS, t_ns=NOW_NS + (n + 1000) * S)) is None
+    assert ours.state(NOW_NS).paces == {}
+
+
 def test_crash_after_own_timestamps_followed_a_clock_ahead() -> None:
     run = Run(0)
     run.wait(60_500)

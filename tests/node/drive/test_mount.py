@@ -264,6 +264,20 @@ def test_reports_before_the_first_command_give_no_lag() -> None:
     assert lag.lag_s == 0.0
 
 
+def test_lag_is_estimated_once_for_all_reports_of_an_update(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A gimbal may send thousands between two updates, and an estimate takes milliseconds."""
+    estimated = list[None]()
+    monkeypatch.setattr(MountLag, "_estimate", lambda *_: estimated.append(None))
+    lag = MountLag()
+    lag.note_command(0, 0.0)
+    for number in range(1000):
+        lag.note_report(number * 1_000_000, 0.1)
+    assert not estimated
+    assert (lag.lag_s, lag.lag_s) == (0.0, 0.0) and len(estimated) == 1
+
+
 @pytest.mark.parametrize("lag_s", [0.05, 0.2, 0.7])
 def test_lag_is_estimated_from_position_reports(lag_s: float) -> None:
     lag, rng = MountLag(), np.random.default_rng(1)

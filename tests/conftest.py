@@ -11,6 +11,7 @@ import subprocess
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -230,3 +231,17 @@ def start_node() -> Iterator[Any]:
     yield start
     for node in nodes:
         end(node.process)
+
+
+@pytest.fixture
+def full_pipe() -> Iterator[int]:
+    """The writing side of a pipe that takes nothing more, since its reader is stopped."""
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(write, bytes(4096))
+    os.set_blocking(write, True)
+    yield write
+    os.close(write)
+    os.close(read)

@@ -20,6 +20,7 @@ from companion.values import UserError, printable, shown
 
 TOKEN: Final = "COMPANION_TOKEN"
 ERROR_MAX: Final = 5000  # longest error line, characters; paths have at most 4096
+NO_THREADS: Final = "can't start new thread"  # text of Python's error
 LOG_EVERY_S: Final = 10.0  # time between two progress lines without a terminal
 CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Settings file (TOML).")
 
@@ -208,6 +209,10 @@ class OneLineErrors(click.Group):
             self._end(str(error) or "interrupted", INTERRUPTED)
         except UserError as error:
             self._end(str(error), 1)
+        except RuntimeError as error:
+            if str(error) != NO_THREADS:
+                raise
+            self._end("the system allows no more threads; see `ulimit -u`", 1)
         except OSError as error:
             where = f"{error.filename}: " if error.filename else ""
             if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT) and not where:

@@ -20,11 +20,15 @@ from companion.values import printable
 STDOUT: Final = 1
 STDERR: Final = 2
 LAST_S: Final = 1.0  # longest wait at the end for who reads, seconds
+NEXT_S: Final = 0.1  # the same after another reader has not read for as long
 WAITING_MAX: Final = 1 << 20  # characters that wait for their reader; lines beyond it are dropped
 AT_ONCE: Final = 1 << 16  # characters written at once
 UNREAD: Final = "nobody read them"
 CLEAR: Final = "\r\033[K"
 NO_READER: Final = (errno.EPIPE, errno.EBADF)  # errors that do not pass
+
+
+_has_waited: Final = threading.Event()  # for a reader at the end, in vain
 
 
 class Printer:
@@ -82,12 +86,19 @@ class Printer:
             raise self._failure
 
     def finish(self) -> None:
-        """Remove the status line, and wait until all is written, at most ``LAST_S``."""
+        """Remove the status line, and wait until all is written.
+
+        At most ``LAST_S``, and no longer once the reader of another printer has kept the end
+        waiting for as long.
+        """
         self.status("")
         with self._changed:
-            self._changed.wait_for(
-                lambda: self._is_idle and not self._lines and self._status is None, LAST_S
+            is_written = self._changed.wait_for(
+                lambda: self._is_idle and not self._lines and self._status is None,
+                NEXT_S if _has_waited.is_set() else LAST_S,
             )
+        if not is_written:
+            _has_waited.set()
 
     def _has_ended(self) -> bool:
         return self._failure is not None and self._failure.errno in NO_READER
@@ -175,6 +186,8 @@ def prints_unblocked() -> Iterator[None]:
     """
     printer = Printer(STDERR)
     lines = _Lines(printer)
-    with redirect_stderr(lines), redirect_stdout(lines):
-        yield
-    printer.finish()
+    try:
+        with redirect_stderr(lines), redirect_stdout(lines):
+            yield
+    finally:
+        printer.finish()

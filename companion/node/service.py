@@ -201,6 +201,8 @@ class Service:
                 await until.wait()
                 server.should_exit = True
                 driving.cancel()  # a device may take as long to its safe state as HTTP to its end
+                if self._live:
+                    group.create_task(closed_within(self._live.stop))
                 await serving
                 for task in tasks:
                     task.cancel()
@@ -217,8 +219,6 @@ class Service:
                 await self._finish()
 
     async def _finish(self) -> None:
-        if self._live:
-            await closed_within(self._live.stop)
         if self._recorder:
             stop = partial(self._recorder.stop, self.pipeline.digest.both())
             await saved_at_end(stop, "the recording", self._say, most_s=None)

@@ -6,7 +6,7 @@ them raises the bound so that it holds whichever is right.
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -53,13 +53,17 @@ class AttitudeAssumptions:
     mount_rad: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Worth:
-    """What a statement demands: a least bound, and the bound that it states; None: states none."""
+    """What a statement demands: a least bound, and the bound that it states; None: states none.
+
+    ``decides`` is False for one that agrees, but may do so because the carrier turned meanwhile.
+    """
 
     t_ns: int
     least_rad: float
     stated_rad: float | None = None
+    decides: bool = True
 
 
 class AttitudeTrust:
@@ -101,13 +105,17 @@ class AttitudeTrust:
         match said:
             case EstimatorStatus():
                 kind = "status"
-                worth: _Worth | None = _Worth(said.t_ns, reported_bound_rad(said, 0.0))
+                least_rad = reported_bound_rad(said, 0.0)
+                worth: _Worth | None = _Worth(t_ns=said.t_ns, least_rad=least_rad)
             case GnssHeading():
                 kind, worth = f"gnss{said.receiver}", self._heading(said)
             case StatedAttitude():
                 kind, worth = f"attitude{said.msgid}", self._attitude(said)
         if worth is None:
             return
+        before = self._worth.get((kind, said.link))
+        if before is not None and not worth.decides:
+            worth = replace(worth, least_rad=before.least_rad)
         oldest_ns = said.t_ns - KEPT_NS
         self._worth = {
             key: one for key, one in self._worth.items() if key[0] != kind or one.t_ns > oldest_ns
@@ -160,33 +168,38 @@ class AttitudeTrust:
         # A nose that is off by an angle is off by asin(sin(angle) / level) in azimuth, at most.
         error_rad = math.asin(math.sin(error_rad) / level)
         own_rad = assumed.factor * max(stated_rad, HEADING_LEAST_RAD)
+        decides = turned_rad <= error_rad + own_rad
         own_rad += math.asin(math.sin(off_rad) / level) - error_rad
         apart_rad = abs(math.remainder(said.heading_rad - newest.yaw_rad, math.tau))
         if apart_rad <= error_rad + own_rad:
-            return _Worth(said.t_ns, 0.0)
-        return _Worth(said.t_ns, min(math.pi, assumed.bound_rad + apart_rad + own_rad))
+            return _Worth(t_ns=said.t_ns, least_rad=0.0, decides=decides)
+        least_rad = min(math.pi, assumed.bound_rad + apart_rad + own_rad)
+        return _Worth(t_ns=said.t_ns, least_rad=least_rad)
 
     def _attitude(self, said: StatedAttitude) -> _Worth:
         """Return the worth of an attitude with a covariance, which must agree with the newest."""
         newest, assumed = self._newest, self._assumed
         if said.ned_from_body is None:
-            return _Worth(said.t_ns, math.pi)
+            return _Worth(t_ns=said.t_ns, least_rad=math.pi)
         stated_rad = None
         if said.deviations_rad is not None:
             # An attitude error is at most the sum of those of its three successive rotations.
             stated_rad = min(math.pi, assumed.factor * sum(said.deviations_rad))
         turned_rad = None if newest is None else self._turned_rad(newest, said.t_ns)
         if newest is None or turned_rad is None:
-            return _Worth(said.t_ns, 0.0, stated_rad)
-        own_rad = (assumed.bound_rad if stated_rad is None else stated_rad) + turned_rad
+            return _Worth(t_ns=said.t_ns, least_rad=0.0, stated_rad=stated_rad)
+        own_rad = assumed.bound_rad if stated_rad is None else stated_rad
         error_rad = assumed.bound_rad
         if stated_rad is not None and assumed.follows_accuracy:
             error_rad = min(error_rad, stated_rad + assumed.mount_rad)
+        decides = turned_rad <= error_rad + own_rad
+        own_rad += turned_rad
         reported = body_from_ned(newest.roll_rad, newest.pitch_rad, newest.yaw_rad)
         apart_rad = rotation_angle_rad(reported @ _rotation(said.ned_from_body))
         if apart_rad <= error_rad + own_rad:
-            return _Worth(said.t_ns, 0.0, stated_rad)
-        return _Worth(said.t_ns, min(math.pi, assumed.bound_rad + apart_rad + own_rad))
+            return _Worth(t_ns=said.t_ns, least_rad=0.0, stated_rad=stated_rad, decides=decides)
+        least_rad = min(math.pi, assumed.bound_rad + apart_rad + own_rad)
+        return _Worth(t_ns=said.t_ns, least_rad=least_rad)
 
 
 def _rate_radps(attitude: Attitude) -> float:

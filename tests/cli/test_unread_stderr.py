@@ -46,19 +46,29 @@ def test_signal_ends_test_traffic_whose_summary_nobody_reads(full_pipe: int) -> 
             assert process.wait(HANG_S) == 0
 
 
-def test_error_is_one_line_while_the_system_allows_no_more_threads() -> None:
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["replay", "missing.tlog", "--center", "5:1"], "missing.tlog"),
+        ([*RUN, "--center", "5:1"], "the system allows no more threads"),
+        (["drive", "none:pointing", "--service", "http://127.0.0.1:9"], "no more threads"),
+    ],
+)
+def test_error_is_one_line_while_the_system_allows_no_more_threads(
+    words: list[str], said: str
+) -> None:
     code = (
         "import threading\n"
         'def refused(self): raise RuntimeError("can\'t start new thread")\n'
         "threading.Thread.start = refused\n"
         "from companion.cli.main import main\n"
-        "main(['replay', 'missing.tlog', '--center', '5:1'])\n"
+        f"main({list(words)})\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=HANG_S, check=False
     )
     assert done.returncode == 1 and len(done.stderr.splitlines()) == 1
-    assert "missing.tlog" in done.stderr
+    assert said in done.stderr
 
 
 def test_interrupt_ends_a_command_that_loads(full_pipe: int) -> None:

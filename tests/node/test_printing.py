@@ -4,7 +4,7 @@ import os
 import resource
 import select
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -39,6 +39,7 @@ def test_lines_that_nobody_reads_are_dropped_and_counted(
     pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(printing, "LAST_S", 0.01)
+    monkeypatch.setattr(printing, "_has_waited", threading.Event())
     read, write = pipe
     printer, line = Printer(write), "x" * 99
     for _ in range(30_000):  # 3 MB
@@ -157,6 +158,7 @@ def test_start_does_not_wait_for_who_reads_the_address(
     os.set_blocking(write, True)
     monkeypatch.setattr(voice, "STDOUT", write)
     monkeypatch.setattr(printing, "LAST_S", 0.01)
+    monkeypatch.setattr(printing, "_has_waited", threading.Event())
     unread = threading.Timer(10.0, os.read, (read, 1 << 20))
     unread.start()
     voice.Lines().serves("companion serves")
@@ -164,3 +166,26 @@ def test_start_does_not_wait_for_who_reads_the_address(
     unread.cancel()
     while b"companion serves" not in os.read(read, 1 << 20):
         pass
+
+
+def test_end_waits_once_for_readers_that_do_not_read(
+    full_pipe: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A service has four printers: one after the other they would delay its end by as many s."""
+    waits = list[float]()
+    wait_for = threading.Condition.wait_for
+
+    def noted(of: threading.Condition, until: Callable[[], bool], most_s: float = -1) -> bool:
+        if most_s < 0:  # the printer's thread
+            return wait_for(of, until)
+        waits.append(most_s)
+        return wait_for(of, until, 0.01)
+
+    monkeypatch.setattr(printing, "_has_waited", threading.Event())
+    monkeypatch.setattr(threading.Condition, "wait_for", noted)
+    printers = [Printer(full_pipe) for _ in range(3)]
+    for one in printers:
+        one.line("unread")
+    for one in printers:
+        one.finish()
+    assert waits == [printing.LAST_S, printing.NEXT_S, printing.NEXT_S]

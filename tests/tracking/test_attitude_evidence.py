@@ -348,3 +348,27 @@ def test_statement_that_is_not_repeated_counts_for_ten_seconds() -> None:
         doubted.turned(attitude(LEVEL, step / 10))
         bounds.append(doubted.bound_rad)
     assert bounds == [math.pi] * 101 + [3.0 * DEG] * 19
+
+
+@pytest.mark.parametrize("kind", ["heading", "attitude"])
+def test_contradiction_stays_while_turns_hide_it(kind: str) -> None:
+    """Only a comparison that would find it decides that it has ended: the carrier turned 35°."""
+    known = trust()
+
+    def said(at_s: float, off_deg: float) -> GnssHeading | StatedAttitude:
+        if kind == "heading":
+            return heading(off_deg, at_s)
+        return stated(Rotation.from_euler("z", off_deg, degrees=True), 1.0, at_s)
+
+    known.turned(attitude(LEVEL, 0.0))
+    known.add(said(0.1, 30.0))
+    contradicted_deg = bound_deg(known)
+    assert contradicted_deg > 30.0
+    for number in range(1, 20):
+        known.turned(attitude(LEVEL, float(number), rates=(0.0, 0.0, 60.0 * DEG)))
+        known.add(said(number + 0.1, 30.0))
+        assert bound_deg(known) == pytest.approx(contradicted_deg)
+    for number in range(20, 23):
+        known.turned(attitude(LEVEL, float(number)))
+        known.add(said(number + 0.1, 0.0))
+    assert bound_deg(known) < 15.0

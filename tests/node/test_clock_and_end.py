@@ -98,18 +98,21 @@ def test_work_in_the_background_waits_for_a_thread(monkeypatch: pytest.MonkeyPat
 
 
 WAITS = """
-import asyncio, threading
+import asyncio, sys, threading
 from companion.node import serving
 
 serving.DISK_WAIT_NOTICE_S = 0.1
 
+def say(text):
+    print(text, file=sys.__stdout__, flush=True)  # what others print goes to stderr
+
 async def main(until):
-    print("ready", flush=True)
+    say("ready")
     await until.wait()
-    print("ending", flush=True)
+    say("ending")
     await asyncio.to_thread(input)
     forever = threading.Event().wait
-    await serving.saved_at_end(forever, "it", lambda text: print(text, flush=True), most_s=None)
+    await serving.saved_at_end(forever, "it", say, most_s=None)
 
 serving.run_until_stopped(main)
 """

@@ -167,13 +167,15 @@ class _Lines(io.TextIOBase):
     def __init__(self, printer: Printer) -> None:
         self._printer = printer
         self._begun = ""
+        self._writing = threading.RLock()  # several threads write, and a handler of signals may
 
     def write(self, text: str, /) -> int:
         """Print the lines that are complete, and keep the rest for the next call."""
-        *lines, begun = (self._begun + text).split("\n")
-        self._begun = begun[-WAITING_MAX:]
-        for line in lines:
-            self._printer.line(line)
+        with self._writing:
+            *lines, begun = (self._begun + text).split("\n")
+            self._begun = begun[-WAITING_MAX:]
+            for line in lines:
+                self._printer.line(line)
         return len(text)
 
 

@@ -94,7 +94,7 @@ def _is_of_use(record: logging.LogRecord) -> bool:
 
     At the end the server reports how many clients did not read: they are not waited for.
     """
-    return not record.msg.startswith("Cancel %s running task(s)")
+    return not str(record.msg).startswith("Cancel %s running task(s)")
 
 
 class RateMeter:

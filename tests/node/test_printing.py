@@ -3,6 +3,7 @@
 import os
 import resource
 import select
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -189,3 +190,13 @@ def test_end_waits_once_for_readers_that_do_not_read(
     for one in printers:
         one.finish()
     assert waits == [printing.LAST_S, printing.NEXT_S, printing.NEXT_S]
+
+
+def test_what_packages_print_goes_to_stderr_line_by_line(capfd: pytest.CaptureFixture[str]) -> None:
+    """It is no JSON, and may come in pieces."""
+    with printing.prints_unblocked():
+        print("one")
+        print("two", file=sys.stderr)
+        for piece in ("th", "ree", "\nfour\n"):
+            sys.stderr.write(piece)
+    assert capfd.readouterr() == ("", "one\ntwo\nthree\nfour\n")

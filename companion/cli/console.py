@@ -15,7 +15,8 @@ from typing import Any, Final, NoReturn
 
 import click
 
-from companion.cli.interrupts import INTERRUPTED, LAST_S, command_ended, interrupts_raised
+from companion.cli.interrupts import INTERRUPTED, command_ended, interrupts_raised
+from companion.node.signals import LAST_S
 from companion.values import UserError, printable, shown
 
 TOKEN: Final = "COMPANION_TOKEN"
@@ -93,10 +94,10 @@ def say(text: str, err: bool = False) -> None:
 
 
 def print_last(text: str, *, err: bool = False) -> None:
-    """Print the last line of a command, and wait ``LAST_S`` for who reads it.
+    """Print the last line of a command; wait at most ``LAST_S`` until it is written.
 
-    If nobody does, the process ends without it: see ``threads_abandoned``. Raises ``OSError`` if
-    it cannot be written.
+    A pipe that is not read blocks the write: the process then ends without the line (see
+    ``threads_abandoned``). Raises ``OSError`` if the output is closed or full.
     """
     failed: list[OSError] = []
 
@@ -231,7 +232,6 @@ class OneLineErrors(click.Group):
         command_ended()
         line = " ".join(said.split())
         cut = line if len(line) <= ERROR_MAX else f"{line[:ERROR_MAX]}…"
-
         with suppress(OSError):  # its reader has ended
             print_last(f"{self.name}: {cut}", err=True)
         sys.exit(status)

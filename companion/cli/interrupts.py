@@ -17,10 +17,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from companion.node.signals import ENDS
+from companion.node.signals import ENDS, LAST_S
 
 INTERRUPTED: Final = 130  # exit status
-LAST_S: Final = 1.0  # longest wait for who reads the last line, seconds
 RETRY_S: Final = 0.02  # delay before an interrupt that could not be raised is tried again
 IMPORTS_S: Final = 3.0
 """Time after which running imports no longer delay an interrupt: a busy machine takes far longer.
@@ -50,7 +49,7 @@ def interrupts_end(name: str) -> Iterator[None]:
     def end(_number: int, _frame: object) -> None:
         if _has_ended.is_set():
             return
-        if select.select((), (2,), (), LAST_S)[1]:  # if somebody reads
+        if select.select((), (2,), (), LAST_S)[1]:  # a full pipe would block for ever
             os.write(2, f"{name}: interrupted\n".encode())
         os._exit(INTERRUPTED)
 
@@ -67,10 +66,11 @@ def interrupts_end(name: str) -> Iterator[None]:
 
 @contextmanager
 def threads_abandoned() -> Iterator[None]:
-    """Context after which the process ends at once, also if threads still run.
+    """Context after which the process ends at once, also if other threads still run.
 
-    The interpreter waits for all threads that are no daemons: for those of a device's library, and
-    for one that prints a line which nobody reads.
+    The interpreter would wait for all non-daemon threads, for ever if they never end: those of a
+    device's library, or one that writes to a full pipe (``companion.cli.console.print_last``).
+    Functions that were registered with ``atexit`` are then not called.
     """
     try:
         yield

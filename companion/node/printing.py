@@ -15,12 +15,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from typing import Final
 
+from companion.node.signals import LAST_S
 from companion.values import printable
 
 STDOUT: Final = 1
 STDERR: Final = 2
-LAST_S: Final = 1.0  # longest wait at the end for who reads, seconds
-NEXT_S: Final = 0.1  # the same after another reader has not read for as long
+AFTER_TIMEOUT_S: Final = 0.1  # the same as ``LAST_S`` after one printer has waited in vain
 WAITING_MAX: Final = 1 << 20  # characters that wait for their reader; lines beyond it are dropped
 AT_ONCE: Final = 1 << 16  # characters written at once
 UNREAD: Final = "nobody read them"
@@ -28,7 +28,8 @@ CLEAR: Final = "\r\033[K"
 NO_READER: Final = (errno.EPIPE, errno.EBADF)  # errors that do not pass
 
 
-_has_waited: Final = threading.Event()  # for a reader at the end, in vain
+_timed_out: Final = threading.Event()
+"""Set once a printer has waited in vain at the end. Several would add up to seconds."""
 
 
 class Printer:
@@ -88,17 +89,16 @@ class Printer:
     def finish(self) -> None:
         """Remove the status line, and wait until all is written.
 
-        At most ``LAST_S``, and no longer once the reader of another printer has kept the end
-        waiting for as long.
+        At most ``LAST_S``; ``AFTER_TIMEOUT_S`` if another printer has already waited in vain.
         """
         self.status("")
         with self._changed:
             is_written = self._changed.wait_for(
                 lambda: self._is_idle and not self._lines and self._status is None,
-                NEXT_S if _has_waited.is_set() else LAST_S,
+                AFTER_TIMEOUT_S if _timed_out.is_set() else LAST_S,
             )
         if not is_written:
-            _has_waited.set()
+            _timed_out.set()
 
     def _has_ended(self) -> bool:
         return self._failure is not None and self._failure.errno in NO_READER
@@ -161,13 +161,13 @@ class Printer:
             return data
 
 
-class _Lines(io.TextIOBase):
-    """Text stream of which each line is printed by a ``Printer``."""
+class _LineStream(io.TextIOBase):
+    """Text stream whose lines are printed by a ``Printer``, so that a write never blocks."""
 
     def __init__(self, printer: Printer) -> None:
         self._printer = printer
         self._begun = ""
-        self._writing = threading.RLock()  # several threads write, and a handler of signals may
+        self._writing = threading.RLock()  # a signal handler may write during another write
 
     def write(self, text: str, /) -> int:
         """Print the lines that are complete, and keep the rest for the next call."""
@@ -181,13 +181,13 @@ class _Lines(io.TextIOBase):
 
 @contextmanager
 def prints_unblocked() -> Iterator[None]:
-    """Context in which what packages print goes to stderr, and waits for no reader.
+    """Context in which ``sys.stdout`` and ``sys.stderr`` are line by line printed on stderr.
 
-    These are the logs of the HTTP server and the event loop, and what the libraries of devices
-    print, which is no JSON either.
+    A write then never blocks, and stdout has the command's own lines alone: its JSON. Packages
+    write there: logs of the HTTP server and the event loop, and messages of devices' libraries.
     """
     printer = Printer(STDERR)
-    lines = _Lines(printer)
+    lines = _LineStream(printer)
     try:
         with redirect_stderr(lines), redirect_stdout(lines):
             yield

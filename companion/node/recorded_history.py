@@ -25,6 +25,7 @@ from companion.views import series
 from companion.views.as_json import Json
 from companion.views.series import Sample
 
+OPTIONS: Final = orjson.OPT_APPEND_NEWLINE | orjson.OPT_SERIALIZE_NUMPY
 PROGRESS_EVERY_S: Final = 0.5
 UAV_SAMPLES_MAX: Final = 36_000
 """Limit on samples times UAVs, some 5 MB of JSON; a longer recording is sampled more rarely."""
@@ -67,8 +68,7 @@ def main() -> None:
         os.nice(19)
     try:
         for line in lines(Path(sys.argv[1])):
-            options = orjson.OPT_APPEND_NEWLINE | orjson.OPT_SERIALIZE_NUMPY
-            sys.stdout.buffer.write(orjson.dumps(line, option=options))
+            sys.stdout.buffer.write(orjson.dumps(line, option=OPTIONS))
             sys.stdout.buffer.flush()
     except (UserError, OSError, ValueError) as error:
         problem = {"problem": str(error)}

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import companion
-from companion.mavlink.links.daemon_threads import closed_within, in_daemon_thread
+from companion.mavlink.links.daemon_threads import close_within, in_daemon_thread
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.node.clock import NodeClock
@@ -202,7 +202,7 @@ class Service:
                 server.should_exit = True
                 driving.cancel()  # a device may take as long to its safe state as HTTP to its end
                 if self._live:
-                    group.create_task(closed_within(self._live.stop))
+                    group.create_task(close_within(self._live.stop))
                 await serving
                 for task in tasks:
                     task.cancel()

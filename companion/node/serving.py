@@ -76,7 +76,7 @@ class Server(uvicorn.Server):
             )
         )
         self._answering = answering
-        logging.getLogger("uvicorn.error").addFilter(_is_of_use)
+        logging.getLogger("uvicorn.error").addFilter(_is_useful)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to accept requests; see ``uvicorn.Server.startup``."""
@@ -89,10 +89,10 @@ class Server(uvicorn.Server):
         yield
 
 
-def _is_of_use(record: logging.LogRecord) -> bool:
-    """Return whether a line of the HTTP server's log is of use to the operator.
+def _is_useful(record: logging.LogRecord) -> bool:
+    """Return whether the operator can use a line of the HTTP server's log.
 
-    At the end the server reports how many clients did not read: they are not waited for.
+    At the end the server logs how many requests it cancels: those of clients that do not read.
     """
     return not str(record.msg).startswith("Cancel %s running task(s)")
 

@@ -8,6 +8,7 @@ from typing import Final
 _IS_DETACHED: Final = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # by nohup
 ENDS: Final = (signal.SIGINT, signal.SIGTERM, *(() if _IS_DETACHED else (signal.SIGHUP,)))
 """Signals that end a command; SIGHUP: its terminal was closed, or its SSH connection."""
+LAST_S: Final = 1.0  # longest wait at the end until the last line is read, seconds
 HELD: Final = (*ENDS, signal.SIGALRM)
 """The alarm is a postponed interrupt (``companion.cli.interrupts``)."""
 

@@ -220,7 +220,7 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
     async def events() -> Response:
         return answer(glance.events(node))
 
-    histories = dict[tuple[int, bool], bytes]()  # by the time of the newest sample
+    histories = dict[bool, tuple[series.Sample | None, bytes]]()  # rounded or not, of a sample
 
     @app.get(
         "/v1/history",
@@ -246,13 +246,12 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
             return make
 
         newest = node.series.newest
-        key = (0 if newest is None else newest[0]), rounded
-        body = histories.get(key)
-        if body is None or newest is None:
+        sampled, body = histories.get(rounded, (None, b""))
+        if sampled is None or sampled is not newest:
             body = await large.made(("history", rounded), prepare)
-            for old in [one for one in histories if one[0] != key[0]]:  # megabytes each
-                del histories[old]
-            histories[key] = body
+            for old in [one for one, (of, _) in histories.items() if of is not newest]:
+                del histories[old]  # megabytes
+            histories[rounded] = newest, body
         return json_response(body)
 
     @app.get(

@@ -57,13 +57,14 @@ class AttitudeAssumptions:
 class _Worth:
     """What a statement demands: a least bound, and the bound that it states; None: states none.
 
-    ``decides`` is False for one that agrees, but may do so because the carrier turned meanwhile.
+    ``is_conclusive`` is False for a comparison that agrees, but might not if the carrier had not
+    turned meanwhile: a contradiction before it then remains.
     """
 
     t_ns: int
     least_rad: float
     stated_rad: float | None = None
-    decides: bool = True
+    is_conclusive: bool = True
 
 
 class AttitudeTrust:
@@ -114,7 +115,7 @@ class AttitudeTrust:
         if worth is None:
             return
         before = self._worth.get((kind, said.link))
-        if before is not None and not worth.decides:
+        if before is not None and not worth.is_conclusive:
             worth = replace(worth, least_rad=before.least_rad)
         oldest_ns = said.t_ns - KEPT_NS
         self._worth = {
@@ -168,11 +169,11 @@ class AttitudeTrust:
         # A nose that is off by an angle is off by asin(sin(angle) / level) in azimuth, at most.
         error_rad = math.asin(math.sin(error_rad) / level)
         own_rad = assumed.factor * max(stated_rad, HEADING_LEAST_RAD)
-        decides = turned_rad <= error_rad + own_rad
+        is_conclusive = turned_rad <= error_rad + own_rad
         own_rad += math.asin(math.sin(off_rad) / level) - error_rad
         apart_rad = abs(math.remainder(said.heading_rad - newest.yaw_rad, math.tau))
         if apart_rad <= error_rad + own_rad:
-            return _Worth(t_ns=said.t_ns, least_rad=0.0, decides=decides)
+            return _Worth(t_ns=said.t_ns, least_rad=0.0, is_conclusive=is_conclusive)
         least_rad = min(math.pi, assumed.bound_rad + apart_rad + own_rad)
         return _Worth(t_ns=said.t_ns, least_rad=least_rad)
 
@@ -192,12 +193,14 @@ class AttitudeTrust:
         error_rad = assumed.bound_rad
         if stated_rad is not None and assumed.follows_accuracy:
             error_rad = min(error_rad, stated_rad + assumed.mount_rad)
-        decides = turned_rad <= error_rad + own_rad
+        is_conclusive = turned_rad <= error_rad + own_rad
         own_rad += turned_rad
         reported = body_from_ned(newest.roll_rad, newest.pitch_rad, newest.yaw_rad)
         apart_rad = rotation_angle_rad(reported @ _rotation(said.ned_from_body))
         if apart_rad <= error_rad + own_rad:
-            return _Worth(t_ns=said.t_ns, least_rad=0.0, stated_rad=stated_rad, decides=decides)
+            return _Worth(
+                t_ns=said.t_ns, least_rad=0.0, stated_rad=stated_rad, is_conclusive=is_conclusive
+            )
         least_rad = min(math.pi, assumed.bound_rad + apart_rad + own_rad)
         return _Worth(t_ns=said.t_ns, least_rad=least_rad)
 

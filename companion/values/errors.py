@@ -27,7 +27,7 @@ def printable(text: str) -> str:
 
 
 def text_of(error: BaseException) -> str:
-    """Return the text of a package's exception; its type if it has none, or has a broken one."""
+    """Return an exception's message; the name of its type if it is empty, or raises itself."""
     try:
         return str(error) or type(error).__name__
     except Exception:

@@ -16,7 +16,7 @@ def needs(package: str, extra: str, what: str, library: str | None = None) -> It
     try:
         yield
     except KeyboardInterrupt:
-        raise  # of the user
+        raise  # the user's Ctrl-C
     except BaseException as error:
         if isinstance(error, ModuleNotFoundError) and error.name == package:
             install = f"pip install 'uav-companion-beams[{extra}]'"

@@ -157,6 +157,7 @@ def moment(
 
 
 def _numbers(track: Track, beam: Beam | None, found: Verdict | None) -> tuple[float | None, ...]:
+    """Return the values in the order of ``NUMBERS``."""
     return (
         None if beam is None else degrees(beam.pointing_bound_rad),
         track.innovation_m,

@@ -40,7 +40,7 @@ def test_lines_that_nobody_reads_are_dropped_and_counted(
     pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(printing, "LAST_S", 0.01)
-    monkeypatch.setattr(printing, "_has_waited", threading.Event())
+    monkeypatch.setattr(printing, "_timed_out", threading.Event())
     read, write = pipe
     printer, line = Printer(write), "x" * 99
     for _ in range(30_000):  # 3 MB
@@ -159,7 +159,7 @@ def test_start_does_not_wait_for_who_reads_the_address(
     os.set_blocking(write, True)
     monkeypatch.setattr(voice, "STDOUT", write)
     monkeypatch.setattr(printing, "LAST_S", 0.01)
-    monkeypatch.setattr(printing, "_has_waited", threading.Event())
+    monkeypatch.setattr(printing, "_timed_out", threading.Event())
     unread = threading.Timer(10.0, os.read, (read, 1 << 20))
     unread.start()
     voice.Lines().serves("companion serves")
@@ -182,14 +182,14 @@ def test_end_waits_once_for_readers_that_do_not_read(
         waits.append(most_s)
         return wait_for(of, until, 0.01)
 
-    monkeypatch.setattr(printing, "_has_waited", threading.Event())
+    monkeypatch.setattr(printing, "_timed_out", threading.Event())
     monkeypatch.setattr(threading.Condition, "wait_for", noted)
     printers = [Printer(full_pipe) for _ in range(3)]
     for one in printers:
         one.line("unread")
     for one in printers:
         one.finish()
-    assert waits == [printing.LAST_S, printing.NEXT_S, printing.NEXT_S]
+    assert waits == [printing.LAST_S, printing.AFTER_TIMEOUT_S, printing.AFTER_TIMEOUT_S]
 
 
 def test_what_packages_print_goes_to_stderr_line_by_line(capfd: pytest.CaptureFixture[str]) -> None:

@@ -352,7 +352,7 @@ def test_statement_that_is_not_repeated_counts_for_ten_seconds() -> None:
 
 @pytest.mark.parametrize("kind", ["heading", "attitude"])
 def test_contradiction_stays_while_turns_hide_it(kind: str) -> None:
-    """Only a comparison that would find it decides that it has ended: the carrier turned 35°."""
+    """Only a comparison that could show it may end it. The carrier may have turned by 35°."""
     known = trust()
 
     def said(at_s: float, off_deg: float) -> GnssHeading | StatedAttitude:

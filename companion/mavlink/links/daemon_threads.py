@@ -9,7 +9,7 @@ from typing import Final, TypeVar
 
 T = TypeVar("T")
 
-CLOSED_S: Final = 1.0  # longest wait for what is closed at the end
+CLOSE_MAX_S: Final = 1.0  # longest wait for a server or session that is closed, seconds
 THREAD_RETRY_S: Final = 0.5  # time until a thread that could not be started is tried again
 
 
@@ -41,10 +41,10 @@ async def in_daemon_thread(work: Callable[[], T], *, at_once: bool = False) -> T
             return await done
 
 
-async def closed_within(close: Callable[[], None], most_s: float = CLOSED_S) -> None:
-    """Close something on a daemon thread, and wait for it, at most ``most_s`` seconds.
+async def close_within(close: Callable[[], None], most_s: float = CLOSE_MAX_S) -> None:
+    """Call ``close`` on a daemon thread, and wait until it returns, at most ``most_s`` seconds.
 
-    Servers of packages wait for their clients: one that sends nothing would delay the end for ever.
+    A package's server may wait for its clients when it is closed: for ever, if one sends nothing.
     """
     closing = asyncio.create_task(in_daemon_thread(close, at_once=True))
     done, _ = await asyncio.wait([closing], timeout=most_s)

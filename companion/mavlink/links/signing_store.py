@@ -27,6 +27,7 @@ from companion.mavlink.trust.signing import (
     LinkSigning,
     NewestTimestamps,
     State,
+    StoredStream,
     fingerprint,
 )
 
@@ -254,11 +255,10 @@ def _checked(data: bytes) -> dict[_LinkKey, _Kept] | None:
 
 def _kept(link: Mapping[str, Any]) -> _Kept:
     streams = {
-        (_whole(sysid), _whole(compid), _whole(link_id)): (
-            _whole(newest),
-            None if lead is None else _whole(lead),
+        (_whole(sysid), _whole(compid), _whole(link_id)): StoredStream(
+            _whole(newest), *(None if value is None else _whole(value) for value in rest)
         )
-        for sysid, compid, link_id, newest, lead in link["streams"]
+        for sysid, compid, link_id, newest, *rest in link["streams"]  # older files have no pace
     }
     state = State(
         clock=_whole(link["clock"]),
@@ -266,10 +266,6 @@ def _kept(link: Mapping[str, Any]) -> _Kept:
         sent=_whole(link["sent"]),
         floor=_whole(link["floor"]),
         streams=streams,
-        paces={
-            (_whole(sysid), _whole(compid), _whole(link_id)): _whole(pace)
-            for sysid, compid, link_id, pace in link.get("paces", ())
-        },
     )
     return _Kept(state, bool(link["clean"]))
 
@@ -290,8 +286,7 @@ def _encoded(links: Mapping[_LinkKey, _Kept]) -> bytes:
             "local": state.local,
             "sent": state.sent,
             "floor": state.floor,
-            "streams": [[*stream, *heard] for stream, heard in state.streams.items()],
-            "paces": [[*stream, pace] for stream, pace in state.paces.items()],
+            "streams": [[*stream, *known] for stream, known in state.streams.items()],
         }
         for link, (state, clean) in links.items()
     ]

@@ -19,10 +19,11 @@ except positions that agree with its path to ``AGREEMENT_M``. A stranger becomes
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
 again; its positions are used only as far as they agree with those of the other. Its attitudes are
 used only where the other has not brought any shortly before: positions that agree prove nothing
-about these. Attitudes that contradict those of the other are announced. If the other has become
-late, by its own stamps, newer attitudes are used, but none newer than it could ever deliver.
-Messages that state accuracies, fixes, a type or the time of day (``_OF_FIRST``) are not used at all
-while the other is current, nor, except the type, from a peer that has brought no position yet.
+about these. Attitudes that contradict those of the other are announced, and so are attitudes of a
+stranger while no known peer brings any. If the other has become late, by its own stamps, newer
+attitudes are used, but none newer than it could ever deliver. Messages that state accuracies,
+fixes, a type or the time of day (``_OF_FIRST``) are not used at all while the other is current,
+nor, except the type, from a peer that has brought no position yet.
 
 Stamps are used only if they are of the other's clock: another clock would look like a restart, or
 like a second vehicle. A peer that becomes more than ten seconds late is a stranger from then on, if
@@ -349,9 +350,9 @@ class KnownPeers:
     def _note_attitudes(
         self, sender: _Sender, name: str, frame: Frame, believed: list[_Peer]
     ) -> None:
-        """Publish that a stranger brings attitudes, of which those that are believed bring none.
+        """Publish that a stranger brings attitudes, but the known peers bring none.
 
-        They could turn the carrier's array, and nothing confirms them.
+        They are not used: nothing confirms them, and they could turn the carrier's array.
         """
         if frame.msgid == ATTITUDE and not any(
             one.brings((ATTITUDE,), frame.t_ns) for one in believed
@@ -410,7 +411,7 @@ class KnownPeers:
                 later = peer if is_later else name
                 if not sender.known[later].is_router:
                     self._demote(sender, later, frame)
-                    if is_later:  # a stranger now, which judges no other peer
+                    if is_later:  # it is a stranger now, and must not demote others
                         return STRANGER
         return None if worst_m <= AGREEMENT_M else STRANGER
 
@@ -590,7 +591,7 @@ def _earlier(sender: _Sender, known: _Peer, now_ns: int) -> list[_Peer]:
 
 
 def _by_standing(sender: _Sender, known: _Peer) -> list[tuple[str, _Peer]]:
-    """Return the other known peers by name, those that are believed over the rest first."""
+    """Return the other known peers by name, in descending order of standing."""
     others = [(name, one) for name, one in sender.known.items() if one is not known]
     return sorted(others, key=lambda named: _standing(named[1]), reverse=True)
 

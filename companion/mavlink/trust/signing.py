@@ -42,7 +42,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from hashlib import sha256
 from hmac import compare_digest
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 from fastcrc import crc16
 
@@ -67,17 +67,26 @@ FOLLOWED_MAX: Final = LATEST - 3650 * 24 * 60 * MINUTE
 """Largest received timestamp that the local one follows: ten years before ``LATEST``."""
 MARGIN: Final = 5 * SECOND
 """Largest lag of a killed process's state on disk: see ``State.after_crash``."""
-COUNTED_SHARE: Final = 0.1  # share of a clock's pace below which timestamps count frames
-PACED: Final = 10 * SECOND  # time over which the pace of a stream is measured
+PACE_WINDOW: Final = 10 * SECOND  # time over which the pace of a stream is measured
+COUNTING_MAX: Final = SECOND // 10  # largest pace of timestamps that count frames, units per second
 BURST: Final = SECOND
 """Upper limit on frames sent in ``MARGIN``; each takes one time unit if the clock is behind."""
 
 Stream = tuple[int, int, int]  # system id and component id of the sender, and its link id
-ReceivedTimestamp = tuple[int, int | None]
-"""Newest timestamp of a stream, and how far it was ahead of the own clock when accepted.
 
-The difference is None for a stream of this node.
-"""
+
+class StoredStream(NamedTuple):
+    """What is stored of a stream.
+
+    newest  its newest timestamp
+    lead    how far that was ahead of the own clock when accepted; None for a stream of this node
+    pace    units per second by which its timestamps advance, if they count frames; None: they
+            follow a clock, or nothing is known
+    """
+
+    newest: int
+    lead: int | None
+    pace: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,11 +97,7 @@ class State:
     local: int = 0  # the local timestamp
     sent: int = 0  # newest timestamp of this node's frames
     floor: int = -1  # new streams must be newer than this
-    streams: Mapping[Stream, ReceivedTimestamp] = field(
-        default_factory=dict
-    )  # newest timestamp of each stream
-    paces: Mapping[Stream, int] = field(default_factory=dict)
-    """Units per second by which timestamps advance that count frames; others follow a clock."""
+    streams: Mapping[Stream, StoredStream] = field(default_factory=dict)
 
     def after_crash(self) -> Self:
         """Return the state to resume with if the process ended up to ``MARGIN`` after saving.
@@ -104,58 +109,64 @@ class State:
         new streams must be newer than anything this node could have sent. Repeated crashes do not
         accumulate margins of clocks.
 
-        A sender may also count its frames from a time that it once received, as ArduPilot and
-        pymavlink do. It would reach a clock's margin after hours, so its stream advances by the
-        frames of ``MARGIN``.
+        The timestamps of ArduPilot and pymavlink do not follow a clock: they count frames, from a
+        time that was received once. Such a sender would need hours to pass a clock's margin. Its
+        stream advances by the frames that it sends in ``MARGIN``.
 
         Not covered: frames accepted in the lost time from a sender whose clock jumped ahead just
-        then, that was new and ahead, that was ahead and returned after a silence longer than that,
-        or that sent more frames than it usually does; until its next frame.
+        then, that was new and ahead, or that was ahead and returned after a silence longer than
+        that; and of a sender that counts frames, those beyond its usual rate. They can be replayed
+        until the sender's next frame.
         """
         sent = max(self.sent + BURST, max(self.local, self.clock) + MARGIN)
-        streams: dict[Stream, ReceivedTimestamp] = {}
-        for stream, (newest, lead) in self.streams.items():
-            if lead is not None:
-                pace = self.paces.get(stream)
-                if pace is None:
-                    moved = max(newest, self.clock + lead + MARGIN)
-                else:
-                    moved = newest + pace * MARGIN // SECOND
-                moved = min(moved, LATEST)
-                streams[stream] = (moved, lead)
-                if newest > self.clock:
-                    sent = max(sent, min(moved, FOLLOWED_MAX))
-        ours = (stream for stream, (_, lead) in self.streams.items() if lead is None)
-        streams.update(dict.fromkeys(ours, (sent, None)))
+        streams: dict[Stream, StoredStream] = {}
+        for stream, (newest, lead, pace) in self.streams.items():
+            if lead is None:
+                continue
+            if pace is None:
+                moved = max(newest, self.clock + lead + MARGIN)
+            else:
+                moved = newest + pace * MARGIN // SECOND
+            moved = min(moved, LATEST)
+            streams[stream] = StoredStream(moved, lead, pace)
+            if newest > self.clock:
+                sent = max(sent, min(moved, FOLLOWED_MAX))
+        ours = (stream for stream, known in self.streams.items() if known.lead is None)
+        streams.update(dict.fromkeys(ours, StoredStream(sent, None)))
         return type(self)(
             clock=self.clock,
             local=self.local,
             sent=sent,
             floor=max(self.floor, sent),
             streams=streams,
-            paces=self.paces,
         )
 
 
 START: Final = State()  # nothing received and nothing sent
 
 
-@dataclass(slots=True)
-class _Pace:
-    """Timestamp and own clock when the measurement of a stream's pace began, and the last pace.
+@dataclass(slots=True, kw_only=True)
+class _OpenStream:
+    """A stream while its link is open: fields as in ``StoredStream``.
 
-    That is None for timestamps that follow a clock.
+    Its pace is measured over windows of ``PACE_WINDOW``. ``window_clock`` is the own clock when the
+    current one began, ``window_stamp`` the stream's timestamp then.
     """
 
-    stamp: int
-    clock: int
-    per_s: int | None = None
+    newest: int
+    lead: int | None
+    pace: int | None = None
+    window_clock: int
+    window_stamp: int
 
-    def measure(self, stamp: int, clock: int) -> None:
-        """End a measurement, and begin the next one."""
-        share = (stamp - self.stamp) / (clock - self.clock)
-        self.per_s = math.ceil(share * SECOND) if share < COUNTED_SHARE else None
-        self.stamp, self.clock = stamp, clock
+    def advance(self, stamp: int, lead: int | None, clock: int) -> None:
+        """Note a newer timestamp."""
+        self.newest, self.lead = stamp, lead
+        elapsed = clock - self.window_clock
+        if elapsed >= PACE_WINDOW:
+            pace = math.ceil((stamp - self.window_stamp) * SECOND / elapsed)
+            self.pace = pace if pace <= COUNTING_MAX else None
+            self.window_clock, self.window_stamp = clock, stamp
 
 
 class NewestTimestamps:
@@ -173,9 +184,9 @@ class NewestTimestamps:
 
     def note_all(self, state: State) -> None:
         """Note the received streams of an earlier run."""
-        for stream, (newest, lead) in state.streams.items():
-            if lead is not None:
-                self.note(stream, newest)
+        for stream, known in state.streams.items():
+            if known.lead is not None:
+                self.note(stream, known.newest)
 
 
 def fingerprint(key: bytes) -> str:
@@ -216,11 +227,15 @@ class LinkSigning:
         self._local = state.local
         self._sent = state.sent
         self._floor = state.floor
-        self._streams = dict(state.streams)
-        self._paces = {
-            stream: _Pace(newest, newest - lead, state.paces.get(stream))
-            for stream, (newest, lead) in state.streams.items()
-            if lead is not None
+        self._streams = {
+            stream: _OpenStream(
+                newest=newest,
+                lead=lead,
+                pace=pace,
+                window_clock=newest - (lead or 0),
+                window_stamp=newest,
+            )
+            for stream, (newest, lead, pace) in state.streams.items()
         }
         self._senders = NewestTimestamps() if senders is None else senders
         self._senders.note_all(state)
@@ -239,17 +254,12 @@ class LinkSigning:
         clock = (frame.t_ns - EPOCH_NS) // UNIT_NS
         stamp = int.from_bytes(raw[-12:-6], "little")
         stream = (raw[5], raw[6], raw[-13])
-        heard = self._streams.get(stream)
-        if stamp <= (heard[0] if heard else self._too_old(clock)):
+        known = self._streams.get(stream)
+        if stamp <= (self._too_old(clock) if known is None else known.newest):
             return Reason.REPLAYED
         if not self._senders.note(stream, stamp):
             return Reason.REPLAYED
-        self._remember(stream, (stamp, stamp - clock))
-        pace = self._paces.get(stream)
-        if pace is None:
-            self._paces[stream] = _Pace(stamp, clock)
-        elif clock - pace.clock >= PACED:
-            pace.measure(stamp, clock)
+        self._remember(stream, stamp, stamp - clock, clock)
         self._local = max(self._local, min(stamp, FOLLOWED_MAX))
         return None
 
@@ -267,7 +277,7 @@ class LinkSigning:
         clock = (now_ns - EPOCH_NS) // UNIT_NS
         stamp = max(clock, self._local + 1, self._sent + 1)
         signed = raw[:1] + body + crc + bytes([self.link_id]) + stamp.to_bytes(6, "little")
-        self._remember((raw[5], raw[6], self.link_id), (stamp, None))
+        self._remember((raw[5], raw[6], self.link_id), stamp, None, clock)
         self._sent = stamp
         return signed + sha256(self._key + signed).digest()[:6]
 
@@ -279,9 +289,9 @@ class LinkSigning:
             local=max(self._local, clock),
             sent=self._sent,
             floor=self._floor,
-            streams=dict(self._streams),
-            paces={
-                stream: pace.per_s for stream, pace in self._paces.items() if pace.per_s is not None
+            streams={
+                stream: StoredStream(known.newest, known.lead, known.pace)
+                for stream, known in self._streams.items()
             },
         )
 
@@ -296,11 +306,15 @@ class LinkSigning:
         """Return the newest timestamp that a new stream must exceed."""
         return max(self._floor, max(self._local, clock) - MINUTE - 1)
 
-    def _remember(self, stream: Stream, heard: ReceivedTimestamp) -> None:
+    def _remember(self, stream: Stream, stamp: int, lead: int | None, clock: int) -> None:
         streams = self._streams
-        if streams.pop(stream, None) is None and len(streams) >= STREAMS_MAX:
-            oldest = next(iter(streams))  # they are in the order of their newest frames
-            self._floor = max(self._floor, streams.pop(oldest)[0])
-            self._paces.pop(oldest, None)
-        streams[stream] = heard
+        known = streams.pop(stream, None)
+        if known is None:
+            if len(streams) >= STREAMS_MAX:
+                oldest = next(iter(streams))  # they are in the order of their newest frames
+                self._floor = max(self._floor, streams.pop(oldest).newest)
+            known = _OpenStream(newest=stamp, lead=lead, window_clock=clock, window_stamp=stamp)
+        else:
+            known.advance(stamp, lead, clock)
+        streams[stream] = known
         self.moves += 1

@@ -57,7 +57,7 @@ def library_errors(device: str) -> Iterator[None]:
     """Raise ``DeviceError`` for whatever the library of a device raises, and for its exits.
 
     Libraries raise plain exceptions, and those of their own parsing of a reply. On the main thread
-    ``KeyboardInterrupt`` is the user's.
+    ``KeyboardInterrupt`` is the user's Ctrl-C, and is raised unchanged.
     """
     try:
         yield

@@ -12,7 +12,7 @@ from functools import partial
 from itertools import islice
 from typing import Any, Final
 
-from companion.mavlink.links.daemon_threads import closed_within, in_daemon_thread
+from companion.mavlink.links.daemon_threads import close_within, in_daemon_thread
 from companion.mavlink.links.descriptors import are_scarce
 from companion.mavlink.links.to_loop import ToLoop
 from companion.mavlink.links.zenoh_bus import Bus, open_peer
@@ -177,7 +177,7 @@ class LiveFleetNode:
             if self._flushing is not None:
                 self._flushing.cancel()
                 self._flushing = None
-            await closed_within(bus.close)
+            await close_within(bus.close)
         return has_no_room
 
     def _is_link_one_way(self, now_ns: int) -> bool:

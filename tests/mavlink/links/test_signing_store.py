@@ -357,7 +357,8 @@ def test_highest_timestamp_survives_repeated_kills(path: Path) -> None:
         refused = guard.refusal(sent(latest_ns)._replace(t_ns=NOW_NS))
         assert refused is (Reason.REPLAYED if number else None)
         snapshot = timestamps.snapshot(NOW_NS + S)
-        assert [one.state.paces for one in snapshot.links.values()] == [{(2, 1, 0): 1}]
+        ((state, _),) = snapshot.links.values()
+        assert {stream[0]: known.pace for stream, known in state.streams.items()} == {1: None, 2: 1}
         timestamps.write(snapshot)
         left = file_after_kill(left, f"left{number}")
         timestamps.close(NOW_NS)
@@ -506,13 +507,14 @@ def written(path: Path, links: object) -> None:
         [LINK | {"streams": None}],
         [LINK | {"streams": [[1, 1, 1]]}],
         [LINK | {"streams": [[1, 1, 1, "a", "b"]]}],
-        [LINK | {"paces": [[1, 1, 0]]}],
-        [LINK | {"paces": [[1, 1, 0, 0.5]]}],
+        [LINK | {"streams": [[1, 1, 0, 5]]}],
+        [LINK | {"streams": [[1, 1, 0, 5, 0, 0.5]]}],
+        [LINK | {"streams": [[1, 1, 0, 5, 0, 1, 1]]}],
         [LINK | {"clock": "x"}],
         [LINK | {"clock": 1.5}],
         [LINK | {"sent": 10**40}],
     ],
-    ids=range(12),
+    ids=range(13),
 )
 def test_wrong_content_with_the_right_digest_is_damage(path: Path, links: object) -> None:
     written(path, [LINK])

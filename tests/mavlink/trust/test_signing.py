@@ -20,6 +20,7 @@ from companion.mavlink.trust.signing import (
     LinkSigning,
     NewestTimestamps,
     State,
+    StoredStream,
     fingerprint,
 )
 from companion.mavlink.wire import encode
@@ -101,7 +102,7 @@ def test_frames_signed_by_pymavlink_are_accepted(link_id: int) -> None:
     for boot_ms in range(300):
         raw = bytes(position(boot_ms).pack(mav))  # type: ignore[attr-defined]
         assert ours.refusal(framed(raw)) is None
-    assert ours.state(NOW_NS).streams == {(1, 1, link_id): (NOW + 299, 299)}
+    assert ours.state(NOW_NS).streams == {(1, 1, link_id): (NOW + 299, 299, None)}
 
 
 def test_signatures_match_pymavlink() -> None:
@@ -466,7 +467,10 @@ def test_timestamp_rules_match_brute_force(sequence: list[tuple]) -> None:  # ty
 # --- crashes ------------------------------------------------------------------------------------
 
 KNOWN = {(1, 1, 0): 0, (2, 1, 0): -3600, (3, 1, 0): 7200}  # seconds by which their clocks are ahead
-KNOWN_AT = {stream: (NOW + (ahead - 1) * UNITS, ahead * UNITS) for stream, ahead in KNOWN.items()}
+KNOWN_AT = {
+    stream: StoredStream(NOW + (ahead - 1) * UNITS, ahead * UNITS)
+    for stream, ahead in KNOWN.items()
+}
 NEW = {(4, 1, 0): 0, (5, 1, 0): -50}
 
 
@@ -596,7 +600,16 @@ def test_crash_while_a_sender_counts_its_frames(hz: int, runs: int) -> None:
     # A clock that follows again has a clock's margin again.
     for n in range(20):
         assert ours.refusal(sent(NOW + (n + 1000) * UNITS, t_ns=NOW_NS + (n + 1000) * S)) is None
-    assert ours.state(NOW_NS).paces == {}
+    assert [known.pace for known in ours.state(NOW_NS).streams.values()] == [None]
+
+
+def test_sender_that_began_minutes_ago_is_accepted_once_it_receives_our_frames() -> None:
+    """As docs/links.md states: timestamps that count frames are too old for a new stream."""
+    mav, ours = vehicle(KEY, NOW - 120 * UNITS), guard()
+    assert ours.refusal(framed(position().pack(mav))) is Reason.REPLAYED  # type: ignore[attr-defined]
+    raw = ours.sign(encode.pack(encode.heartbeat(OURS), 0), NOW_NS)
+    assert mav.parse_char(raw) is not None
+    assert ours.refusal(framed(position().pack(mav))) is None  # type: ignore[attr-defined]
 
 
 def test_crash_after_own_timestamps_followed_a_clock_ahead() -> None:

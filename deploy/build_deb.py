@@ -72,7 +72,7 @@ def _fill(tree: Path, arch: str, python: str, packages: bool) -> None:
     for module in ("companion", "sitl_replay"):
         name = module.replace("_", "-")
         text = (FILES / "launcher").read_text(encoding="utf-8")
-        text = text.replace("@NAME@", name).replace("@MODULE@", module)
+        text = text.replace("@MODULE@", module)
         _write(tree / "usr/bin" / name, text, 0o755)
     service = tree / "usr/lib/systemd/system/companion.service"
     _write(service, unit(*_documented_units()))

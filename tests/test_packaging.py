@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import sysconfig
@@ -331,6 +332,27 @@ def test_debian_system_user_can_be_created(unpacked: Path, tmp_path: Path) -> No
     )
     assert done.returncode == 0, done.stderr
     assert "companion:x:" in (tmp_path / "etc/passwd").read_text()
+
+
+def test_debian_launchers_start_python_with_interrupts_blocked(
+    unpacked: Path, tmp_path: Path
+) -> None:
+    """A starting interpreter would answer with a traceback, and a shell could forget them."""
+    python, blocked = tmp_path / "python3", 0
+    python.write_text("#!/bin/sh\nexec grep SigBlk /proc/self/status\n")
+    python.chmod(0o755)
+    for path in (unpacked / "usr/bin").iterdir():
+        launcher = tmp_path / path.name
+        launcher.write_text(path.read_text().replace("/usr/bin/python3", str(python)))
+        launcher.chmod(0o755)
+        assert "/env " in launcher.read_text().splitlines()[0]
+        done = subprocess.run(
+            [launcher], capture_output=True, text=True, timeout=HANG_S, check=True
+        )
+        blocked = int(done.stdout.split()[1], 16)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            assert blocked >> (number - 1) & 1, (path.name, number)
+    assert blocked, "no launcher was found: nothing was tested"
 
 
 @pytest.fixture

@@ -80,7 +80,7 @@ def test_interrupt_is_never_a_traceback(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["companion", "sitl-replay"])
 def test_script_catches_no_signal_that_it_would_forget(name: str, tmp_path: Path) -> None:
-    """Of 3260 interrupts of a starting shell with a trap, 14 were lost as it was replaced."""
+    """Of 3500 interrupts of a starting dash, which catches them by itself, 2 were lost."""
     caught = tmp_path / "caught"
     for program, text in (
         ("env", f"grep SigCgt /proc/$PPID/status > {caught}\nexit 1\n"),
@@ -90,10 +90,13 @@ def test_script_catches_no_signal_that_it_would_forget(name: str, tmp_path: Path
         (tmp_path / program).chmod(0o755)
     shutil.copy(ROOT / "scripts" / name, tmp_path / name)
     path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    subprocess.run(["/bin/sh", tmp_path / name], check=True, timeout=HANG_S, env=path)
+    shell = Path("/bin/sh").resolve()
+    subprocess.run([shell, tmp_path / name], check=True, timeout=HANG_S, env=path)
+    numbers = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+    if shell.name == "bash":
+        numbers.remove(signal.SIGINT)  # it ends itself by the signal that it caught
     signals = int(caught.read_text().split()[1], 16)
-    # The shell itself catches SIGINT: it ends at once.
-    assert not any(signals >> (number - 1) & 1 for number in (signal.SIGTERM, signal.SIGHUP))
+    assert not any(signals >> (number - 1) & 1 for number in numbers)
 
 
 @pytest.mark.parametrize("name", ["companion", "sitl-replay"])

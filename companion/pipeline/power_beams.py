@@ -11,8 +11,8 @@ from companion.values import ComplexArray, Observation
 from companion.values.budget import Budget
 
 UPDATES_KEPT: Final = 32  # newest updates whose weights are kept
-ENTRIES_KEPT: Final = 2**21
-"""Limit on the weights that are kept, 32 MB; the newest update is kept whatever its size."""
+ENTRIES_KEPT: Final = 2**19
+"""Limit on the weights that are kept, 8 MB; the newest update is kept whatever its size."""
 POWERS_PER_S: Final = 20.0
 """Most observations of powers per second that are processed: each takes some milliseconds."""
 POWERS_SAVED: Final = 20.0  # most that may arrive at once

@@ -50,6 +50,8 @@ STOP_MAX_S: Final = 10.0
 """Longest wait at the end of the service for a disk that takes nothing, seconds."""
 RESUME_BATCH: Final = 2000
 """Events written at once when a recording continues: some hundred kilobytes."""
+INDEX_MAX_BYTES: Final = 8 << 20
+"""Size of a part's index, which is kept in memory until its end, at which a new part begins."""
 MIN_FREE_BYTES: Final = 8 << 20
 """Free space needed to continue a recording; with less, it would soon stop again."""
 
@@ -58,7 +60,10 @@ _TOO_SLOW: Final = "the disk was too slow"
 
 @dataclass(frozen=True, slots=True)
 class Rotation:
-    """When a new part of a recording begins: at a size in bytes or after seconds; None: never."""
+    """When a new part of a recording begins: at a size in bytes or after seconds; None: never.
+
+    One that has either limit also begins when the index of a part reaches ``INDEX_MAX_BYTES``.
+    """
 
     size_bytes: float | None = None
     after_s: float | None = None
@@ -345,7 +350,8 @@ class BackgroundRecorder:
         size_bytes, after_s = self._rotation.size_bytes, self._rotation.after_s
         large = size_bytes is not None and self.bytes >= size_bytes
         old = after_s is not None and time.monotonic() - self._begun_s >= after_s
-        if self._writer.flushed and (large or old):
+        indexed = self._rotation != NEVER and self._writer.index_bytes >= INDEX_MAX_BYTES
+        if self._writer.flushed and (large or old or indexed):
             self._writer.close({}, is_continued=True)
             self.bytes = self._writer.size_bytes  # also if the next part cannot be opened
             self._open_next()

@@ -61,8 +61,11 @@ class McapFile:
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         self._counts: dict[int, int] = {}  # messages by channel
-        self._times_ns: list[tuple[int, int]] = []  # least and largest of each chunk
-        self._chunks: list[ChunkIndex] = []
+        self._least_ns = self._greatest_ns = 0  # of all messages
+        # The index entries of the chunks, as bytes: an object for each channel takes ten times as
+        # much memory, and a chunk of a second may have hundreds of channels.
+        self._chunk_indexes = bytearray()
+        self._chunk_count = 0
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         # The chunk in progress: its records, their size, and the times and places by channel.
@@ -177,7 +180,7 @@ class McapFile:
             index_at += len(indexes[-1])
             self._counts[channel_id] = self._counts.get(channel_id, 0) + len(entries) // 2
         self._stream.write(b"".join(indexes))
-        self._chunks.append(
+        self._chunk_indexes += _bytes(
             ChunkIndex(
                 chunk_length=len(chunk),
                 chunk_start_offset=chunk_at,
@@ -190,35 +193,43 @@ class McapFile:
                 uncompressed_size=len(contents),
             )
         )
-        self._times_ns.append((least_ns, greatest_ns))
+        self._chunk_count += 1
+        first = self._chunk_count == 1
+        self._least_ns = least_ns if first else min(self._least_ns, least_ns)
+        self._greatest_ns = max(self._greatest_ns, greatest_ns)
         self._parts, self._size, self._entries = [], 0, {}
 
     # --- the end ----------------------------------------------------------------------------
+
+    @property
+    def index_bytes(self) -> int:
+        """Size of the chunks' index, which is kept in memory until the end."""
+        return len(self._chunk_indexes)
 
     def finish(self) -> None:
         """End the current chunk, and write the summary and the footer."""
         self._end_chunk()
         self._stream.write(_bytes(DataEnd(0)))
-        start = self._stream.tell()
-        summary = bytearray()
+        start = place = self._stream.tell()
         groups: list[tuple[int, list[bytes]]] = [
             (Opcode.SCHEMA, [_bytes(one) for one in self._schemas]),
             (Opcode.CHANNEL, [_bytes(one) for one in self._channels]),
             (Opcode.STATISTICS, [_bytes(self._statistics())]),
-            (Opcode.CHUNK_INDEX, [_bytes(one) for one in self._chunks]),
+            (Opcode.CHUNK_INDEX, [bytes(self._chunk_indexes)]),
             (Opcode.ATTACHMENT_INDEX, [_bytes(one) for one in self._attachments]),
             (Opcode.METADATA_INDEX, [_bytes(one) for one in self._metadata]),
         ]
-        offsets = []
+        offsets, checksum = [], 0
         for opcode, records in groups:
             joined = b"".join(records)
-            offsets.append(_bytes(SummaryOffset(opcode, start + len(summary), len(joined))))
-            summary += joined
-        offsets_at = start + len(summary)
-        summary += b"".join(offsets)
-        checked = summary + _FOOTER_START.pack(Opcode.FOOTER, 20, start, offsets_at)
-        self._stream.write(summary)
-        self._stream.write(_bytes(Footer(start, offsets_at, zlib.crc32(checked))))
+            offsets.append(_bytes(SummaryOffset(opcode, place, len(joined))))
+            self._stream.write(joined)
+            checksum = zlib.crc32(joined, checksum)
+            place += len(joined)
+        ending = b"".join(offsets)
+        checked = ending + _FOOTER_START.pack(Opcode.FOOTER, 20, start, place)
+        self._stream.write(ending)
+        self._stream.write(_bytes(Footer(start, place, zlib.crc32(checked, checksum))))
         self._stream.write(MAGIC)
 
     def _statistics(self) -> Statistics:
@@ -226,10 +237,10 @@ class McapFile:
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts=self._counts,
-            chunk_count=len(self._chunks),
+            chunk_count=self._chunk_count,
             message_count=sum(self._counts.values()),
-            message_end_time=max((one[1] for one in self._times_ns), default=0),
-            message_start_time=min((one[0] for one in self._times_ns), default=0),
+            message_end_time=self._greatest_ns,
+            message_start_time=self._least_ns,
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )

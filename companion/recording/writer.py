@@ -133,6 +133,11 @@ class Writer:
         return self._topics.messages
 
     @property
+    def index_bytes(self) -> int:
+        """Size of the file's index, which is kept in memory until it is closed."""
+        return self._mcap.index_bytes
+
+    @property
     def path(self) -> Path:
         """Current path of the file: ``….mcap.active`` until it is closed."""
         return self._final if self._finished else _beside(self._final)

@@ -17,7 +17,7 @@ from companion.server.threads import in_thread
 LEAST_BYTES: Final = 1024  # a smaller body fits into one packet as it is
 AT_ONCE_BYTES: Final = 16_384  # largest body that is compressed on the event loop, within 1 ms
 KEPT: Final = 32  # compressed bodies that are kept for the next client
-KEPT_BYTES: Final = 16 << 20  # most bytes of these before compression; one larger body is kept
+KEPT_BYTES: Final = 4 << 20  # most bytes of these before compression; one larger body is kept
 GZIP_LEVEL, ZSTD_LEVEL = 6, 6
 _GZIP_WINDOW: Final = 31  # zlib's largest window, with the head of gzip
 _TEXTS: Final = ("text/", "application/json", "application/javascript", "image/svg+xml")

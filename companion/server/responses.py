@@ -20,7 +20,7 @@ from starlette.types import Receive, Scope, Send
 from companion.server import models
 from companion.server.compression import LEAST_BYTES, SharedCompression, is_text, preferred
 from companion.server.giving_way import GivingWay
-from companion.server.held_bodies import HeldBodies
+from companion.server.held_bodies import HELD
 from companion.server.observation_model import ObservationInput
 from companion.views.as_json import Json
 
@@ -80,7 +80,7 @@ class BodyResponse(Response):
         if len(self.body) <= PIECE_BYTES:
             await super().__call__(scope, receive, send)
             return
-        with _held.hold(bytes(self.body)):
+        with HELD.hold(bytes(self.body)):
             await self._send_pieces(send)
 
     async def _send_pieces(self, send: Send) -> None:
@@ -103,7 +103,6 @@ class BodyResponse(Response):
 
 
 _compression: Final = SharedCompression()
-_held: Final = HeldBodies()
 
 
 def answer(content: object, status: int = 200) -> Response:

@@ -25,7 +25,10 @@ class SharedWork:
         if task is None:
             task = self._next[what] = asyncio.create_task(self._after_the_last(what, work))
             task.add_done_callback(seen)
-        return await asyncio.shield(task)  # a client that leaves must not cancel it for others
+        try:
+            return await asyncio.shield(task)  # a client that leaves must not cancel it for others
+        finally:
+            del task  # the traceback of its error would keep it, and all that its frames refer to
 
     async def _after_the_last(self, what: Hashable, work: Callable[[], Awaitable[T]]) -> T:
         last = self._running.get(what)

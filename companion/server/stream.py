@@ -14,9 +14,9 @@ takes nothing for 10 s is disconnected. A message is encoded once for all client
 request. ``events`` are sent when there is a new one.
 
 Close codes: 1003 the client sent a message (the stream accepts none), 1008 it sent too much, 1012
-the service ends, 1013 too many streams are open, or another client takes this place, 4401 missing
-or wrong token (``access``), 4403 request by a page from elsewhere, 4422 invalid arguments. The
-reason has details.
+the service ends, 1013 too many streams are open, another client takes this place, or large messages
+are taken too slowly (``held_bodies``), 4401 missing or wrong token (``access``), 4403 request by a
+page from elsewhere, 4422 invalid arguments. The reason has details.
 """
 
 import asyncio
@@ -33,6 +33,7 @@ from starlette.websockets import WebSocket
 from companion.server import topics
 from companion.server.access import accept, is_same_site
 from companion.server.connections import most_connections
+from companion.server.held_bodies import HELD
 from companion.server.large_answers import LargeAnswers
 from companion.server.shared_work import seen
 from companion.server.topics import Body, Topic
@@ -188,7 +189,9 @@ class Stream:
         hearing = asyncio.create_task(websocket.receive())
         try:
             await asyncio.wait({sending, hearing}, return_when=asyncio.FIRST_COMPLETED)
-            if sending.done():
+            if sending.cancelled():
+                await _close_for_memory(websocket)
+            elif sending.done():
                 sending.result()
         finally:
             sending.cancel()
@@ -214,10 +217,12 @@ class Stream:
                         except HTTPException:  # too many requests at once: with the next update
                             continue
                         said[topic] = version
-                        if isinstance(message, bytes):
-                            await websocket.send_bytes(message)
-                        else:
-                            await websocket.send_text(message)
+                        with HELD.hold(message):
+                            if isinstance(message, bytes):
+                                await websocket.send_bytes(message)
+                            else:
+                                await websocket.send_text(message)
+                        del message  # which has megabytes; the next one may be seconds away
                         self.sent += 1
             # A change during the sending to a slow client does not wait for another tick.
             if self._node.pipeline.updates == updates:
@@ -240,7 +245,10 @@ class Stream:
         what = (topic, uavs, version)
         if what not in messages:
             messages[what] = _task(self._encoded(self._snapshot, *what))
-        return await asyncio.shield(messages[what])  # other clients may wait for it too
+        try:
+            return await asyncio.shield(messages[what])  # other clients may wait for it too
+        finally:
+            del messages  # see ``SharedWork.run``
 
     async def _encoded(
         self, snapshot: Snapshot, topic: Topic, uavs: frozenset[str], version: object
@@ -248,7 +256,10 @@ class Stream:
         key = (topic, version)
         if key not in snapshot.bodies:
             snapshot.bodies[key] = _task(topics.body(topic, self._node, self._large))
-        body = await asyncio.shield(snapshot.bodies[key])
+        try:
+            body = await asyncio.shield(snapshot.bodies[key])
+        finally:
+            del snapshot  # see ``SharedWork.run``
         encode = partial(topics.message, topic, body, uavs)
         what, many = (topic, uavs, version), topics.is_large(topic, body, uavs)
         return await self._large.made(what, lambda: encode, is_large=many)
@@ -264,6 +275,15 @@ def _connection(websocket: WebSocket) -> BoundedWebSocket | None:
     """Return a client's connection; None under another server, as in tests."""
     found: BoundedWebSocket | None = websocket.scope.get("state", {}).get("connection")
     return found
+
+
+async def _close_for_memory(websocket: WebSocket) -> None:
+    reason = "this client takes large messages too slowly"
+    connection = _connection(websocket)
+    if connection is None:
+        await websocket.close(TOO_MANY, reason)
+    else:
+        connection.replace(TOO_MANY, reason)
 
 
 def _host(websocket: WebSocket) -> str | None:

@@ -684,6 +684,21 @@ def test_latest_utc_offset_counts_in_any_order_of_the_parts(tmp_path: Path) -> N
     assert utc_offset_ns(logs) == utc_offset_ns(logs[::-1]) == -9
 
 
+@pytest.mark.parametrize("rotation", [Rotation(1e9, None), Rotation()])
+def test_large_index_ends_a_part_unless_parts_have_no_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rotation: Rotation
+) -> None:
+    monkeypatch.setattr(background, "INDEX_MAX_BYTES", 1)
+    made = recorder(tmp_path, rotation)
+    made.start()
+    hand_over(made, ticks(0, 10))
+    if rotation != Rotation():
+        wait_for_part(made, 2)
+    hand_over(made, ticks(10, 20))
+    made.stop({})
+    assert len(parts_of(tmp_path)) == (1 if rotation == Rotation() else 2)
+
+
 @pytest.mark.parametrize("rotation", [Rotation(1.0, None), Rotation(None, 0.5)])
 def test_new_part_continues_where_the_previous_ends(tmp_path: Path, rotation: Rotation) -> None:
     made = recorder(tmp_path, rotation)

@@ -393,7 +393,7 @@ def test_bodies_held_for_slow_clients_are_limited_in_all(
             slow[1].transport.get_extra_info("socket").setsockopt(SOL_SOCKET, SO_RCVBUF, 2048)
             slow[0]._transport.pause_reading()  # type: ignore[attr-defined]
             slow[1].write(get("/openapi.json"))
-            while not responses._held.bytes:
+            while not held_bodies.HELD.bytes:
                 await asyncio.sleep(0.001)
             quick[1].write(get("/openapi.json", f"Accept-Encoding: {other}", "Connection: close"))
             assert (await asyncio.wait_for(quick[0].read(), HANG_S)).startswith(b"HTTP/1.1 200 OK")
@@ -408,7 +408,7 @@ def test_bodies_held_for_slow_clients_are_limited_in_all(
             return "open"
 
     assert run_async(asked_twice()) == expected
-    assert responses._held.bytes == 0
+    assert held_bodies.HELD.bytes == 0
 
 
 # --- WebSockets -----------------------------------------------------------------------------------

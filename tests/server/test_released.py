@@ -1,0 +1,185 @@
+"""What clients took or left is released at once: no cycle keeps it until a full collection.
+
+Full collections are rare, because their time grows with all that is tracked.
+"""
+
+import asyncio
+import gc
+import weakref
+from collections.abc import Iterator
+from socket import SO_RCVBUF, SOL_SOCKET
+from typing import Any
+
+import pytest
+from http_support import Client, connected, ends, served
+from starlette.exceptions import HTTPException
+from support import HANG_S, run_async
+from websockets.asyncio.client import connect
+
+from companion.server import held_bodies, stream, topics
+from companion.server.shared_work import SharedWork
+from companion.server.stream import Snapshot
+
+
+@pytest.fixture(autouse=True)
+def uncollected() -> Iterator[None]:
+    """No cycle is collected during a test."""
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()
+
+
+def upgrade(query: str, *headers: str) -> bytes:
+    """A request of a stream, which may be compressed."""
+    lines = [
+        f"GET /v1/stream?{query} HTTP/1.1", "Host: 127.0.0.1", "Connection: Upgrade",
+        "Upgrade: websocket", "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", *headers,
+    ]  # fmt: skip
+    return "\r\n".join([*lines, "", ""]).encode()
+
+
+async def streaming(port: int, query: str, *headers: str) -> Client:
+    """A raw client of a stream whose handshake is done."""
+    client = await connected(port)
+    client[1].write(upgrade(query, *headers))
+    head = await asyncio.wait_for(client[0].readuntil(b"\r\n\r\n"), HANG_S)
+    assert head.startswith(b"HTTP/1.1 101")
+    return client
+
+
+def is_sending(task: "asyncio.Task[Any]") -> bool:
+    """Whether a task serves a client of a stream."""
+    return getattr(task.get_coro(), "__qualname__", "").endswith("Stream._send")
+
+
+def test_failed_work_is_released_with_its_error() -> None:
+    class Answer:
+        pass
+
+    async def failed() -> "weakref.ref[Answer]":
+        answer = Answer()
+
+        async def work(held: Answer) -> None:
+            raise HTTPException(503)
+
+        shared = SharedWork()
+        with pytest.raises(HTTPException):
+            await shared.run("answer", lambda: work(answer))
+        return weakref.ref(answer)
+
+    assert run_async(failed())() is None
+
+
+def test_refused_messages_release_their_snapshots(
+    make_node: Any, serving: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = 0
+
+    async def refused(*_: object) -> None:
+        nonlocal asked
+        asked += 1
+        raise HTTPException(503)
+
+    async def check() -> None:
+        node = make_node()
+        async with (
+            serving(node) as at,
+            connect(f"ws://{at}/v1/stream?topic=beams&rate_hz=100") as websocket,
+        ):
+            await asyncio.wait_for(websocket.recv(), HANG_S)
+            monkeypatch.setattr(topics, "body", refused)
+            for number in range(10):
+                async with asyncio.timeout(HANG_S):
+                    while asked <= number:
+                        node.tick()
+                        await asyncio.sleep(0.01)
+            monkeypatch.undo()
+            node.tick()
+            await asyncio.wait_for(websocket.recv(), HANG_S)
+            async with asyncio.timeout(HANG_S):  # a task may be about to end
+                while sum(map(is_kept, gc.get_objects())) > 2:  # the newest snapshot, its message
+                    await asyncio.sleep(0.01)
+
+    def is_kept(one: object) -> bool:
+        if isinstance(one, asyncio.Task):
+            return getattr(one.get_coro(), "__qualname__", "").endswith("Stream._encoded")
+        return isinstance(one, Snapshot)
+
+    run_async(check())
+
+
+def test_stream_keeps_no_message_until_the_next_one(make_node: Any, serving: Any) -> None:
+    async def check() -> None:
+        async with (
+            serving(make_node()) as at,
+            connect(f"ws://{at}/v1/stream?topic=beams") as websocket,
+        ):
+            await asyncio.wait_for(websocket.recv(), HANG_S)
+            (sending,) = filter(is_sending, asyncio.all_tasks())
+            frame: Any = sending.get_coro().cr_frame  # type: ignore[union-attr]
+            async with asyncio.timeout(HANG_S):
+                while "message" in frame.f_locals:
+                    await asyncio.sleep(0.001)
+            assert frame.f_locals["said"]
+
+    run_async(check())
+
+
+def test_messages_held_for_slow_streams_are_limited_in_all(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The oldest stream is closed for another one's message, but not for one of its own."""
+    monkeypatch.setattr(held_bodies, "BYTES_MAX", 1_500_000)  # two messages have more
+    monkeypatch.setattr(topics, "message", lambda *_: "x" * 1_000_000)
+
+    async def slow(port: int, uav: str, node: Any) -> Client:
+        client = await connected(port)
+        client[1].transport.get_extra_info("socket").setsockopt(SOL_SOCKET, SO_RCVBUF, 2048)
+        client[0]._transport.pause_reading()  # type: ignore[attr-defined]
+        before = stream_count()
+        client[1].write(upgrade(f"topic=beams&uav={uav}"))
+        async with asyncio.timeout(HANG_S):
+            while stream_count() == before or not held_bodies.HELD.bytes:
+                await ticked(node)
+        return client
+
+    async def ticked(node: Any) -> None:
+        node.tick()
+        for _ in range(20):
+            await asyncio.sleep(0)
+
+    def stream_count() -> int:
+        return sum(map(is_sending, asyncio.all_tasks()))
+
+    async def check() -> None:
+        node = make_node()
+        async with served(node) as port:
+            first = await slow(port, "1:1", node)
+            same = await slow(port, "1:1", node)
+            assert stream_count() == 2
+            second = await slow(port, "2:1", node)
+            async with asyncio.timeout(HANG_S):
+                while stream_count() > 1:
+                    await ticked(node)
+            for client in (first, same):
+                client[0]._transport.resume_reading()  # type: ignore[attr-defined]
+                assert await ends(client)
+            second[1].transport.abort()
+
+    run_async(check())
+    assert held_bodies.HELD.bytes == 0
+
+
+def test_stream_is_closed_with_a_reason_if_it_reads_again(make_node: Any, serving: Any) -> None:
+    async def check() -> None:
+        async with serving(make_node()) as at, connect(f"ws://{at}/v1/stream") as websocket:
+            await asyncio.wait_for(websocket.recv(), HANG_S)
+            (sending,) = filter(is_sending, asyncio.all_tasks())
+            sending.cancel()
+            await asyncio.wait_for(websocket.wait_closed(), HANG_S)
+            assert websocket.close_code == stream.TOO_MANY
+            assert "too slowly" in (websocket.close_reason or "")
+
+    run_async(check())

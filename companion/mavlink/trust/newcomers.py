@@ -11,9 +11,10 @@ costs its first peer nothing.
 
 Where something else takes the time, such as requests, frames take less than ``BUSY`` of it. Once
 they have been late for a second and are lost, or too old to be of use, half of their work is
-dropped, since those of all senders become two seconds late otherwise; but none of senders that were
-there through ten seconds in time. While the process stays busy, more are served only after a time
-that doubles. Frames that are in time for ten seconds let more senders be served in any case.
+dropped, since those of all senders become two seconds late otherwise; but none of the first eight
+senders, or of those that were there through ten seconds in time. While the process stays busy, more
+are served only after a time that doubles. Frames that are in time for ten seconds let more senders
+be served in any case.
 """
 
 from bisect import bisect_left
@@ -45,6 +46,8 @@ LATE_NS: Final = 50_000_000  # age of a datagram that was read late
 USELESS_NS: Final = 500_000_000  # age of a datagram that is of no use to a beam
 LATE_FOR_NS: Final = 1_000_000_000
 """Time of late windows in turn after which useless frames cost senders their place."""
+FIRST: Final = 8
+"""Oldest senders that are not dropped where something else takes the time: it gains too little."""
 FITS: Final = 1.1  # ratio of expected work to what fits, up to which no sender is dropped
 FREE: Final = 0.5  # share of one processor below which nothing else takes the time
 LEAST: Final = 0.2  # share of the time below which fewer senders would make no difference
@@ -238,7 +241,8 @@ class Newcomers:
         self.generation += 1
         self._watched_until_ns = now_ns + LIMITED_NS
         if sum(expected_s.values()) > FITS * most_s:
-            self._drop(expected_s, most_s, 0 if is_busy else self._settled_below)
+            kept_below = 0 if is_busy else max(FIRST, self._settled_below)
+            self._drop(expected_s, most_s, kept_below)
             if not is_busy:
                 self._hold(now_ns)
 
@@ -278,16 +282,16 @@ class Newcomers:
             return True
         return False
 
-    def _drop(self, worked_s: dict[Account, float], most_s: float, settled_below: int = 0) -> None:
+    def _drop(self, worked_s: dict[Account, float], most_s: float, kept_below: int = 0) -> None:
         """Serve the oldest senders whose frames took at most ``most_s`` together.
 
-        Always one, and those with numbers below ``settled_below``.
+        Always one, and those with numbers below ``kept_below``.
         """
         numbers = sorted((number, account) for account, number in self._numbers.items())
         if self._served_below is not None:
             del numbers[bisect_left(numbers, (self._served_below,)) :]
         total_s, most = sum(worked_s.values()), len(numbers)
-        least = max(1, bisect_left(numbers, (settled_below,)))
+        least = max(1, bisect_left(numbers, (kept_below,)))
         while most > least and total_s > most_s:
             most -= 1
             total_s -= worked_s.get(numbers[most][1], 0.0)

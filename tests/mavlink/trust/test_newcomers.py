@@ -122,6 +122,15 @@ def test_senders_that_were_there_in_calm_times_are_not_dropped_for_other_work() 
     assert len(served(senders, 100, end * WINDOW_NS)) < 50
 
 
+def test_first_senders_are_not_dropped_for_other_work() -> None:
+    """An honest UAV that came 4 s before a flood and its requests had no beams for 12 s."""
+    senders, end = Newcomers(), 200
+    for number in range(1, end):
+        senders.late()
+        window(senders, number, 0.4)
+    assert served(senders, 100, end * WINDOW_NS) == list(range(newcomers.FIRST))
+
+
 def test_frames_that_waited_cost_no_more_senders_their_place() -> None:
     """What waits in the socket is two seconds old, for a cause that is gone."""
     senders = Newcomers()

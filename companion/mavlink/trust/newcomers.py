@@ -11,10 +11,9 @@ costs its first peer nothing.
 
 Where something else takes the time, such as requests, frames take less than ``BUSY`` of it. Once
 they have been late for a second and are lost, or too old to be of use, half of their work is
-dropped, since those of all senders become two seconds late otherwise; but none of the first eight
-senders, or of those that were there through ten seconds in time. While the process stays busy, more
-are served only after a time that doubles. Frames that are in time for ten seconds let more senders
-be served in any case.
+dropped, since all become two seconds late otherwise; but none of the first eight senders, or of
+those that were there through ten seconds in time. While the process stays busy, more are served
+only after a time that doubles. Frames in time for ten seconds let more senders be served anyway.
 """
 
 from bisect import bisect_left
@@ -46,8 +45,7 @@ LATE_NS: Final = 50_000_000  # age of a datagram that was read late
 USELESS_NS: Final = 500_000_000  # age of a datagram that is of no use to a beam
 LATE_FOR_NS: Final = 1_000_000_000
 """Time of late windows in turn after which useless frames cost senders their place."""
-FIRST: Final = 8
-"""Oldest senders that are not dropped where something else takes the time: it gains too little."""
+FIRST: Final = 8  # oldest senders, which are not dropped where something else takes the time
 FITS: Final = 1.1  # ratio of expected work to what fits, up to which no sender is dropped
 FREE: Final = 0.5  # share of one processor below which nothing else takes the time
 LEAST: Final = 0.2  # share of the time below which fewer senders would make no difference
@@ -241,8 +239,7 @@ class Newcomers:
         self.generation += 1
         self._watched_until_ns = now_ns + LIMITED_NS
         if sum(expected_s.values()) > FITS * most_s:
-            kept_below = 0 if is_busy else max(FIRST, self._settled_below)
-            self._drop(expected_s, most_s, kept_below)
+            self._drop(expected_s, most_s, 0 if is_busy else max(FIRST, self._settled_below))
             if not is_busy:
                 self._hold(now_ns)
 

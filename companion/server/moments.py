@@ -56,7 +56,10 @@ class Moments:
             task = asyncio.create_task(self._work(lead_ms, what, make, is_shared=is_shared))
             task.add_done_callback(seen)
             self._waiting[key] = task
-        return await asyncio.shield(task)  # a client that leaves must not cancel it for others
+        try:
+            return await asyncio.shield(task)  # a client that leaves must not cancel it for others
+        finally:
+            del task  # see ``SharedWork.run``
 
     def _begin_moment(self) -> int:
         """Return the time of the node; forget the answers for a moment that has passed."""

@@ -17,6 +17,8 @@ Close codes: 1003 the client sent a message (the stream accepts none), 1008 it s
 the service ends, 1013 too many streams are open, another client takes this place, or large messages
 are taken too slowly (``held_bodies``), 4401 missing or wrong token (``access``), 4403 request by a
 page from elsewhere, 4422 invalid arguments. The reason has details.
+
+Over 300 lines: a client's messages, and the limits on all clients, share one state.
 """
 
 import asyncio
@@ -42,6 +44,8 @@ from companion.values import UAV_FORMS, UserError, is_uav_id
 from companion.views.state import Node
 
 T = TypeVar("T")
+Message = tuple[Topic, frozenset[str], object]
+"""Identity of a message: its topic, the UAVs that it is about (all if empty), its version."""
 
 TOO_MANY: Final = 1013
 ELSEWHERE: Final = 4403
@@ -64,6 +68,8 @@ SLOTS: Final = 32
 The slots span the first half of the update interval: a hundred messages at once would delay
 everything else. A few clients do not wait.
 """
+VERSIONS_AT_ONCE: Final = 2
+"""Versions of a topic that are being made: each holds an update. Beyond them, clients wait."""
 _EARLY: Final = 0.25
 """Fraction of its period by which a message may be early, as updates are not exact."""
 
@@ -114,9 +120,7 @@ class Snapshot:
 
     number: int
     bodies: dict[tuple[Topic, object], "asyncio.Task[Body]"] = field(default_factory=dict)
-    messages: dict[tuple[Topic, frozenset[str], object], "asyncio.Task[str | bytes]"] = field(
-        default_factory=dict
-    )
+    messages: dict[Message, "asyncio.Task[str | bytes]"] = field(default_factory=dict)
 
 
 class Stream:
@@ -128,6 +132,7 @@ class Stream:
         self._open: list[WebSocket] = []
         self._node = node
         self._snapshot = Snapshot(-1)
+        self._being_made = set[Message]()
         self._in_slot = [0] * SLOTS
         self._topics = 0  # of all clients together
         self._slot_s = 0.5 / SLOTS / node.pipeline.settings.beams.update_hz
@@ -214,7 +219,7 @@ class Stream:
                     if said.get(topic) != version:
                         try:
                             message = await self._message(topic, asked.uavs, version)
-                        except HTTPException:  # too many requests at once: with the next update
+                        except HTTPException:  # too much is being made: with the next update
                             continue
                         said[topic] = version
                         with HELD.hold(message):
@@ -244,11 +249,22 @@ class Stream:
             uavs = frozenset()  # the same message for all clients
         what = (topic, uavs, version)
         if what not in messages:
+            self._refuse_if_many(topic, version)
             messages[what] = _task(self._encoded(self._snapshot, *what))
+            self._being_made.add(what)
+            messages[what].add_done_callback(lambda _: self._being_made.discard(what))
+        task = messages[what]
+        del messages  # of megabytes, and this one may be made seconds later
         try:
-            return await asyncio.shield(messages[what])  # other clients may wait for it too
+            return await asyncio.shield(task)  # other clients may wait for it too
         finally:
-            del messages  # see ``SharedWork.run``
+            del task  # see ``SharedWork.run``
+
+    def _refuse_if_many(self, topic: Topic, version: object) -> None:
+        """Raise ``HTTPException`` 503 while too many versions of a topic are being made."""
+        others = {one[2] for one in self._being_made if one[0] is topic} - {version}
+        if len(others) >= VERSIONS_AT_ONCE:
+            raise HTTPException(503, "too many updates are being encoded at once")
 
     async def _encoded(
         self, snapshot: Snapshot, topic: Topic, uavs: frozenset[str], version: object
@@ -256,10 +272,12 @@ class Stream:
         key = (topic, version)
         if key not in snapshot.bodies:
             snapshot.bodies[key] = _task(topics.body(topic, self._node, self._large))
+        task = snapshot.bodies[key]
+        del snapshot
         try:
-            body = await asyncio.shield(snapshot.bodies[key])
+            body = await asyncio.shield(task)
         finally:
-            del snapshot  # see ``SharedWork.run``
+            del task
         encode = partial(topics.message, topic, body, uavs)
         what, many = (topic, uavs, version), topics.is_large(topic, body, uavs)
         return await self._large.made(what, lambda: encode, is_large=many)

@@ -162,20 +162,20 @@ async def body(topic: Topic, node: Node, large: LargeAnswers) -> Body:
         case Topic.UAVS:
             return await large.uavs()
         case Topic.BEAMS:
-            return await large.made(topic, partial(_beams, node))
+            return await large.made(("body", topic), partial(_beams, node))
         case Topic.WEIGHTS:
             many = beams > FEW_WEIGHTS
-            return await large.made(topic, partial(_weights, node), is_large=many)
+            return await large.made(("body", topic), partial(_weights, node), is_large=many)
         case Topic.RECORDS:
             many = node.pipeline.settings.records.guaranteed
-            return await large.made(topic, partial(_records, node), is_large=many)
+            return await large.made(("body", topic), partial(_records, node), is_large=many)
         case Topic.STATUS:
             return _status(node)
         case Topic.LINKS:
             many = state.component_count(node) > FEW_ITEMS
-            return await large.made(topic, partial(_links, node), is_large=many)
+            return await large.made(("body", topic), partial(_links, node), is_large=many)
         case Topic.FLEET:
             many = fleet_view.offer_count(node.fleet_status()) > FEW_ITEMS
-            return await large.made(topic, partial(_fleet, node), is_large=many)
+            return await large.made(("body", topic), partial(_fleet, node), is_large=many)
         case Topic.EVENTS:
             return glance.events(node)

@@ -694,6 +694,8 @@ def test_large_index_ends_a_part_unless_parts_have_no_end(
     hand_over(made, ticks(0, 10))
     if rotation != Rotation():
         wait_for_part(made, 2)
+    else:
+        wait_until(lambda: on_disk(made) >= 10)
     hand_over(made, ticks(10, 20))
     made.stop({})
     assert len(parts_of(tmp_path)) == (1 if rotation == Rotation() else 2)

@@ -5,6 +5,7 @@ Full collections are rare, because their time grows with all that is tracked.
 
 import asyncio
 import gc
+import json
 import weakref
 from collections.abc import Iterator
 from socket import SO_RCVBUF, SOL_SOCKET
@@ -16,9 +17,10 @@ from starlette.exceptions import HTTPException
 from support import HANG_S, run_async
 from websockets.asyncio.client import connect
 
-from companion.server import held_bodies, stream, topics
+from companion.server import app, held_bodies, stream, topics
 from companion.server.shared_work import SharedWork
 from companion.server.stream import Snapshot
+from companion.server.topics import Topic
 
 
 @pytest.fixture(autouse=True)
@@ -30,8 +32,14 @@ def uncollected() -> Iterator[None]:
     gc.enable()
 
 
+def get(path: str) -> bytes:
+    """A request on a connection of its own."""
+    lines = [f"GET {path} HTTP/1.1", "Host: 127.0.0.1", "Connection: close"]
+    return "\r\n".join([*lines, "", ""]).encode()
+
+
 def upgrade(query: str, *headers: str) -> bytes:
-    """A request of a stream, which may be compressed."""
+    """A request of a stream."""
     lines = [
         f"GET /v1/stream?{query} HTTP/1.1", "Host: 127.0.0.1", "Connection: Upgrade",
         "Upgrade: websocket", "Sec-WebSocket-Version: 13",
@@ -49,9 +57,14 @@ async def streaming(port: int, query: str, *headers: str) -> Client:
     return client
 
 
+def is_of(task: "asyncio.Task[Any]", name: str) -> bool:
+    """Whether a task runs a coroutine of that name."""
+    return getattr(task.get_coro(), "__qualname__", "").endswith(name)
+
+
 def is_sending(task: "asyncio.Task[Any]") -> bool:
     """Whether a task serves a client of a stream."""
-    return getattr(task.get_coro(), "__qualname__", "").endswith("Stream._send")
+    return is_of(task, "Stream._send")
 
 
 def test_failed_work_is_released_with_its_error() -> None:
@@ -104,8 +117,75 @@ def test_refused_messages_release_their_snapshots(
 
     def is_kept(one: object) -> bool:
         if isinstance(one, asyncio.Task):
-            return getattr(one.get_coro(), "__qualname__", "").endswith("Stream._encoded")
+            return is_of(one, "Stream._encoded")
         return isinstance(one, Snapshot)
+
+    run_async(check())
+
+
+def test_messages_of_few_updates_are_made_at_once(
+    make_node: Any, serving: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a busy machine 155 snapshots waited to be encoded, each with its update: 140 MB."""
+    waiting, most = asyncio.Event(), 0
+
+    async def slow(topic: Topic, *_: object) -> Any:
+        nonlocal most
+        most = max(most, sum(isinstance(one, Snapshot) for one in gc.get_objects()))
+        await waiting.wait()
+        raise HTTPException(503)
+
+    async def check() -> None:
+        node = make_node()
+        async with serving(node) as at:
+            monkeypatch.setattr(topics, "body", slow)
+            address = f"ws://{at}/v1/stream?topic=beams&topic=weights&rate_hz=100"
+            for _ in range(6):
+                async with connect(address, close_timeout=1):
+                    for _ in range(3):
+                        node.tick()
+                        await asyncio.sleep(0.02)
+            made = [one for one in asyncio.all_tasks() if is_of(one, "Stream._encoded")]
+            assert 0 < len(made) <= stream.VERSIONS_AT_ONCE
+            waiting.set()
+            monkeypatch.undo()
+            async with connect(address) as websocket:  # and it continues
+                node.tick()
+                await asyncio.wait_for(websocket.recv(), HANG_S)
+
+    run_async(check())
+    assert 0 < most <= stream.VERSIONS_AT_ONCE + 1
+
+
+def test_path_and_stream_of_one_name_share_no_answer(
+    make_node: Any, serving: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stream of links took the path's bytes for its body, and the path the stream's."""
+    monkeypatch.setattr(topics, "FEW_ITEMS", -1)
+    monkeypatch.setattr(app, "FEW_ITEMS", -1)
+
+    async def check() -> None:
+        node = make_node()
+        async with served(node) as port, connect(address(port)) as websocket:
+
+            async def asks() -> None:
+                for _ in range(30):
+                    client = await connected(port)
+                    client[1].write(get("/v1/links"))
+                    body = await asyncio.wait_for(client[0].read(), HANG_S)
+                    assert body.startswith(b"HTTP/1.1 200"), body
+                    assert b'"links":[{' in body
+
+            async def hears() -> None:
+                for _ in range(30):
+                    node.tick()
+                    message = json.loads(await asyncio.wait_for(websocket.recv(), HANG_S))
+                    assert message["links"]
+
+            await asyncio.gather(asks(), asks(), hears())
+
+    def address(port: int) -> str:
+        return f"ws://127.0.0.1:{port}/v1/stream?topic=links&rate_hz=100"
 
     run_async(check())
 

@@ -68,6 +68,7 @@ FOLLOWED_MAX: Final = LATEST - 3650 * 24 * 60 * MINUTE
 MARGIN: Final = 5 * SECOND
 """Largest lag of a killed process's state on disk: see ``State.after_crash``."""
 PACE_WINDOW: Final = 10 * SECOND  # time over which the pace of a stream is measured
+FIRST_PACE: Final = SECOND // 2  # time after which a first pace is known
 COUNTING_MAX: Final = SECOND // 10  # largest pace of timestamps that count frames, units per second
 BURST: Final = SECOND
 """Upper limit on frames sent in ``MARGIN``; each takes one time unit if the clock is behind."""
@@ -149,24 +150,29 @@ START: Final = State()  # nothing received and nothing sent
 class _OpenStream:
     """A stream while its link is open: fields as in ``StoredStream``.
 
-    Its pace is measured over windows of ``PACE_WINDOW``. ``window_clock`` is the own clock when the
-    current one began, ``window_stamp`` the stream's timestamp then.
+    Its pace is measured over windows of ``PACE_WINDOW``, the first of which gives it before its end
+    as well. ``window`` is the own clock and the stream's timestamp when the current one began; None
+    until the stream is heard on this link.
     """
 
     newest: int
     lead: int | None
     pace: int | None = None
-    window_clock: int
-    window_stamp: int
+    window: tuple[int, int] | None = None
+    is_first_window: bool = True
 
     def advance(self, stamp: int, lead: int | None, clock: int) -> None:
         """Note a newer timestamp."""
         self.newest, self.lead = stamp, lead
-        elapsed = clock - self.window_clock
+        if self.window is None:
+            self.window = clock, stamp
+        elapsed = clock - self.window[0]
+        if elapsed >= (FIRST_PACE if self.is_first_window else PACE_WINDOW):
+            pace = math.ceil((stamp - self.window[1]) * SECOND / elapsed)
+            least = self.pace or 0 if self.is_first_window else 0  # it may begin slowly
+            self.pace = max(pace, least) if pace <= COUNTING_MAX else None
         if elapsed >= PACE_WINDOW:
-            pace = math.ceil((stamp - self.window_stamp) * SECOND / elapsed)
-            self.pace = pace if pace <= COUNTING_MAX else None
-            self.window_clock, self.window_stamp = clock, stamp
+            self.window, self.is_first_window = (clock, stamp), False
 
 
 class NewestTimestamps:
@@ -228,13 +234,7 @@ class LinkSigning:
         self._sent = state.sent
         self._floor = state.floor
         self._streams = {
-            stream: _OpenStream(
-                newest=newest,
-                lead=lead,
-                pace=pace,
-                window_clock=newest - (lead or 0),
-                window_stamp=newest,
-            )
+            stream: _OpenStream(newest=newest, lead=lead, pace=pace)
             for stream, (newest, lead, pace) in state.streams.items()
         }
         self._senders = NewestTimestamps() if senders is None else senders
@@ -313,7 +313,7 @@ class LinkSigning:
             if len(streams) >= STREAMS_MAX:
                 oldest = next(iter(streams))  # they are in the order of their newest frames
                 self._floor = max(self._floor, streams.pop(oldest).newest)
-            known = _OpenStream(newest=stamp, lead=lead, window_clock=clock, window_stamp=stamp)
+            known = _OpenStream(newest=stamp, lead=lead, window=(clock, stamp))
         else:
             known.advance(stamp, lead, clock)
         streams[stream] = known

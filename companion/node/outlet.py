@@ -4,6 +4,7 @@ Data received over these links is ignored.
 """
 
 import asyncio
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
@@ -19,7 +20,9 @@ from companion.settings.model import Settings
 from companion.values import Notice, Source, Track
 from companion.views import passed_on
 
-AT_ONCE: Final = 16  # UAVs whose positions are sent in one iteration of the event loop
+AT_ONCE: Final = 4  # UAVs whose positions are sent in one iteration of the event loop
+SHARE: Final = 0.2
+"""Largest share of the time for sending. With many UAVs and clients, each is sent less often."""
 
 
 class Outlet:
@@ -86,12 +89,12 @@ class Outlet:
             await asyncio.sleep(due_s - loop.time())
 
     async def _send_once(self) -> None:
-        """Send the positions of all UAVs, of a few in one iteration of the event loop."""
+        """Send the positions of all UAVs: of a few, and then a rest by ``SHARE``."""
         uavs = [uav for uav in self._pipeline.tracker.uavs if self._admits(uav)]
         for start in range(0, len(uavs), AT_ONCE):
-            now_ns = self._now_ns()
+            begun_s, now_ns = time.thread_time(), self._now_ns()
             self._send(self._pipeline.tracks(now_ns, now_ns, uavs[start : start + AT_ONCE]))
-            await asyncio.sleep(0)
+            await asyncio.sleep((time.thread_time() - begun_s) * (1 / SHARE - 1))
 
     def _send(self, tracks: list[Track]) -> None:
         if self._frames:

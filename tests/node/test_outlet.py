@@ -2,20 +2,23 @@
 
 import asyncio
 import socket
+import time
 from itertools import count
 from pathlib import Path
 from typing import Any
 
+import pytest
 import siege
 from pymavlink.dialects.v20 import common
 from support import HANG_S, ROOT, free_port, run_async
 
+from companion.mavlink.links.transport import Link
 from companion.mavlink.wire.decode import PREDICTION
 from companion.mavlink.wire.encode import pack
 from companion.mavlink.wire.framing import Splitter
 from companion.mavlink.wire.positions import PASSED_ON
 from companion.node import moment
-from companion.node.outlet import Outlet
+from companion.node.outlet import SHARE, Outlet
 from companion.settings.model import Settings
 from companion.values import Frame, Reason, Rejection
 from companion.views import passed_on
@@ -63,6 +66,44 @@ def test_forwarded_position_is_no_report_of_its_vehicle() -> None:
     assert isinstance(frame, Frame)
     (rejected,) = [out for out in pipeline.step(frame) if isinstance(out, Rejection)]
     assert (rejected.reason, rejected.detail) == (Reason.DUPLICATE, PREDICTION)
+
+
+def test_sending_takes_a_limited_share_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1000 UAVs, sent to 60 clients, left no time for the carrier's attitudes: no beams."""
+    settings = Settings().override(center={"source": "5:1"})
+    log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
+    pipeline, update = moment.look([log], settings, "3")
+    now_ns = (update.t_ns + 20_000_000 * n for n in count())
+    sent = 0
+
+    def slow(_link: Link, _raw: bytes) -> int:
+        nonlocal sent
+        sent += 1
+        until_s = time.thread_time() + 0.003
+        while time.thread_time() < until_s:
+            pass
+        return 1
+
+    async def share() -> float:
+        outlet = Outlet(
+            settings=settings.override(
+                out={"urls": [f"udpout:127.0.0.1:{free_port(socket.SOCK_DGRAM)}"], "rate_hz": 50.0}
+            ),
+            pipeline=pipeline,
+            notify=lambda notice: None,
+            now_ns=lambda: next(now_ns),
+        )
+        outlet.open()
+        begun_s, used_s = time.monotonic(), time.thread_time()
+        task = asyncio.create_task(outlet.run())
+        async with asyncio.timeout(20):
+            while sent < 100:
+                await asyncio.sleep(0.01)
+        task.cancel()
+        return (time.thread_time() - used_s) / (time.monotonic() - begun_s)
+
+    monkeypatch.setattr(Link, "send_raw", slow)
+    assert run_async(share()) < 1.5 * SHARE
 
 
 def test_silent_vehicle_does_not_live_on_by_its_forwarded_positions(

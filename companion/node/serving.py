@@ -18,6 +18,7 @@ import uvicorn
 
 from companion.mavlink.links.daemon_threads import in_daemon_thread
 from companion.mavlink.links.descriptors import raise_limit
+from companion.node.memory import return_freed_memory
 from companion.node.printing import STDERR, Printer, prints_unblocked
 from companion.node.signals import ENDS, interrupts_held, release_interrupts
 from companion.server.app import create_app
@@ -209,6 +210,7 @@ def _configure_interpreter() -> None:
     yields after a millisecond, because each HTTP answer waits for the interpreter several times.
     """
     sys.setswitchinterval(0.001)
+    return_freed_memory()
     gc.collect()
     gc.freeze()
     gc.set_threshold(2_000, 10, 100)

@@ -18,9 +18,9 @@ def resident_mb():
 first = b"x" * 1_000_000
 del first  # glibc's own threshold grows with the first large block that is freed
 before, large, small = resident_mb(), [], []
-for _ in range(100):
-    large.append(b"x" * 600_000)
-    small.append(b"x" * 2000)
+for number in range(100):
+    large.append(bytes([number]) * 600_000)
+    small.append(bytes([number]) * 2000)
 del large
 print(resident_mb() - before)
 """

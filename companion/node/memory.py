@@ -11,7 +11,7 @@ from typing import Final
 LARGE_BYTES: Final = 256 << 10
 """Size from which a block has pages of its own, which are returned when it is freed."""
 ARENAS: Final = 2
-"""Heaps of all threads together: of which only one at a time runs Python."""
+"""Heaps of all threads together; only one thread at a time runs Python."""
 # glibc, malloc.h
 _M_TRIM_THRESHOLD: Final = -1
 _M_MMAP_THRESHOLD: Final = -3

@@ -32,6 +32,36 @@ def uncollected() -> Iterator[None]:
     gc.enable()
 
 
+class Watched(Snapshot):
+    """A snapshot that ``KEPT`` knows while it is kept."""
+
+    __hash__ = object.__hash__
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        KEPT.add(self)
+
+
+KEPT = weakref.WeakSet[object]()
+"""The snapshots and tasks of messages that exist."""
+
+
+@pytest.fixture
+def watched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Streams whose snapshots and tasks are in ``KEPT``."""
+    task: Any = stream._task
+
+    def kept(work: Any) -> "asyncio.Task[Any]":
+        made: asyncio.Task[Any] = task(work)
+        if is_of(made, "Stream._encoded"):
+            KEPT.add(made)
+        return made
+
+    KEPT.clear()
+    monkeypatch.setattr(stream, "Snapshot", Watched)
+    monkeypatch.setattr(stream, "_task", kept)
+
+
 def get(path: str) -> bytes:
     """A request on a connection of its own."""
     lines = [f"GET {path} HTTP/1.1", "Host: 127.0.0.1", "Connection: close"]
@@ -86,9 +116,9 @@ def test_failed_work_is_released_with_its_error() -> None:
 
 
 def test_refused_messages_release_their_snapshots(
-    make_node: Any, serving: Any, monkeypatch: pytest.MonkeyPatch
+    make_node: Any, serving: Any, monkeypatch: pytest.MonkeyPatch, watched: None
 ) -> None:
-    asked = 0
+    asked, body = 0, topics.body
 
     async def refused(*_: object) -> None:
         nonlocal asked
@@ -108,30 +138,25 @@ def test_refused_messages_release_their_snapshots(
                     while asked <= number:
                         node.tick()
                         await asyncio.sleep(0.01)
-            monkeypatch.undo()
+            monkeypatch.setattr(topics, "body", body)
             node.tick()
             await asyncio.wait_for(websocket.recv(), HANG_S)
             async with asyncio.timeout(HANG_S):  # a task may be about to end
-                while sum(map(is_kept, gc.get_objects())) > 2:  # the newest snapshot, its message
+                while len(KEPT) > 2:  # the newest snapshot and its message
                     await asyncio.sleep(0.01)
-
-    def is_kept(one: object) -> bool:
-        if isinstance(one, asyncio.Task):
-            return is_of(one, "Stream._encoded")
-        return isinstance(one, Snapshot)
 
     run_async(check())
 
 
 def test_messages_of_few_updates_are_made_at_once(
-    make_node: Any, serving: Any, monkeypatch: pytest.MonkeyPatch
+    make_node: Any, serving: Any, monkeypatch: pytest.MonkeyPatch, watched: None
 ) -> None:
     """On a busy machine 155 snapshots waited to be encoded, each with its update: 140 MB."""
-    waiting, most = asyncio.Event(), 0
+    waiting, most, body = asyncio.Event(), 0, topics.body
 
     async def slow(topic: Topic, *_: object) -> Any:
         nonlocal most
-        most = max(most, sum(isinstance(one, Snapshot) for one in gc.get_objects()))
+        most = max(most, sum(isinstance(one, Snapshot) for one in KEPT))
         await waiting.wait()
         raise HTTPException(503)
 
@@ -139,7 +164,7 @@ def test_messages_of_few_updates_are_made_at_once(
         node = make_node()
         async with serving(node) as at:
             monkeypatch.setattr(topics, "body", slow)
-            address = f"ws://{at}/v1/stream?topic=beams&topic=weights&rate_hz=100"
+            address = f"ws://{at}/v1/stream?topic=beams&rate_hz=100"
             for _ in range(6):
                 async with connect(address, close_timeout=1):
                     for _ in range(3):
@@ -148,7 +173,7 @@ def test_messages_of_few_updates_are_made_at_once(
             made = [one for one in asyncio.all_tasks() if is_of(one, "Stream._encoded")]
             assert 0 < len(made) <= stream.VERSIONS_AT_ONCE
             waiting.set()
-            monkeypatch.undo()
+            monkeypatch.setattr(topics, "body", body)
             async with connect(address) as websocket:  # and it continues
                 node.tick()
                 await asyncio.wait_for(websocket.recv(), HANG_S)

@@ -177,10 +177,10 @@ WAYS: Final = (
             "route:/v1/mavlink/vehicles/{sys}/components/{comp}/messages",
             "route:/v1/mavlink/vehicles/{sys}/components/{comp}/messages/{name}",
         ),
-        size=f"{held_bodies.BYTES_MAX >> 20} MB of bodies that clients have not taken yet",
+        size=f"{held_bodies.BYTES_MAX >> 20} MB of bodies and messages of streams that clients have not taken yet",
         items="one for all that ask for the same moment",
         work=SLOTS,
-        over="503, before any work; the oldest answers are abandoned",
+        over="503, before any work; the oldest answers are abandoned, or streams closed",
         test="tests/server/test_hostile_clients.py::test_excess_work_is_rejected_with_503",
     ),
     WayIn(
@@ -231,7 +231,7 @@ WAYS: Final = (
     WayIn(
         name="WebSocket `/v1/stream`",
         covers=("route:/v1/stream",),
-        size=f"{websocket_connections.BYTES_PER_S:.0f} bytes/s from a client, {kb(int(websocket_connections.BYTES_SAVED))} at once; nothing is queued for it",
+        size=f"{websocket_connections.BYTES_PER_S:.0f} bytes/s from a client, {kb(int(websocket_connections.BYTES_SAVED))} at once; nothing is queued for it; its unread messages count as bodies of answers",
         items=f"{stream.CLIENTS_MAX} clients, at most half of the connections; {request_queue.STREAMS_PER_S:.0f} new ones/s;"
         f" {stream.MESSAGES_PER_S:.0f} messages/s to all",
         work="a message is encoded once for all",

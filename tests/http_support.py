@@ -13,6 +13,20 @@ from companion.server.access import bind
 REQUEST = b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
 
 
+def get(path: str, *headers: str) -> bytes:
+    """A request, on a connection that stays open unless a header closes it."""
+    lines = [f"GET {path} HTTP/1.1", "Host: 127.0.0.1", *headers]
+    return "\r\n".join([*lines, "", ""]).encode()
+
+
+def upgrade(query: str = "") -> bytes:
+    """A request that opens a stream."""
+    return get(
+        f"/v1/stream?{query}", "Connection: Upgrade", "Upgrade: websocket",
+        "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+    )  # fmt: skip
+
+
 Client = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 OPEN: list[asyncio.StreamWriter] = []
 

@@ -338,10 +338,11 @@ def test_debian_launchers_start_python_with_interrupts_blocked(
     unpacked: Path, tmp_path: Path
 ) -> None:
     """A starting interpreter would answer with a traceback, and a shell could forget them."""
-    python, blocked = tmp_path / "python3", 0
+    python, launchers = tmp_path / "python3", list((unpacked / "usr/bin").iterdir())
+    assert len(launchers) == 2
     python.write_text("#!/bin/sh\nexec grep SigBlk /proc/self/status\n")
     python.chmod(0o755)
-    for path in (unpacked / "usr/bin").iterdir():
+    for path in launchers:
         launcher = tmp_path / path.name
         launcher.write_text(path.read_text().replace("/usr/bin/python3", str(python)))
         launcher.chmod(0o755)
@@ -352,7 +353,6 @@ def test_debian_launchers_start_python_with_interrupts_blocked(
         blocked = int(done.stdout.split()[1], 16)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             assert blocked >> (number - 1) & 1, (path.name, number)
-    assert blocked, "no launcher was found: nothing was tested"
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
-"""Memory of a long-running process: what is freed goes back to the system.
+"""Memory of a long-running process: freed blocks go back to the system.
 
-glibc keeps freed blocks for later ones. Beside many UAVs the large ones, bodies of answers and
-arrays of an update, leave gaps between small ones that stay: a fifth of the memory.
+glibc keeps them for later ones. With many UAVs, freed large blocks (bodies of answers, arrays of an
+update) between small ones that stay were a fifth of the memory.
 """
 
 import ctypes
@@ -19,7 +19,7 @@ _M_ARENA_MAX: Final = -8
 
 
 def return_freed_memory() -> None:
-    """Set glibc's allocator to return large blocks; do nothing with another one."""
+    """Set glibc's allocator to return large blocks; leave other allocators as they are."""
     if sys.platform != "linux":
         return
     try:

@@ -22,7 +22,7 @@ from companion.views import passed_on
 
 AT_ONCE: Final = 4  # UAVs whose positions are sent in one iteration of the event loop
 SHARE: Final = 0.2
-"""Largest share of the time for sending. With many UAVs and clients, each is sent less often."""
+"""Largest share of the time for sending; with many UAVs or clients, each UAV is sent less often."""
 
 
 class Outlet:
@@ -89,7 +89,7 @@ class Outlet:
             await asyncio.sleep(due_s - loop.time())
 
     async def _send_once(self) -> None:
-        """Send the positions of all UAVs: of a few, and then a rest by ``SHARE``."""
+        """Send the positions of all UAVs, a few at a time, with rests in between by ``SHARE``."""
         uavs = [uav for uav in self._pipeline.tracker.uavs if self._admits(uav)]
         for start in range(0, len(uavs), AT_ONCE):
             begun_s, now_ns = time.thread_time(), self._now_ns()

@@ -205,9 +205,9 @@ def _configure_interpreter() -> None:
 
     The time of a collection is proportional to the objects that it examines. Objects loaded by now
     are exempt; small collections are frequent and full ones rare (measured at 10 000 frames/s: 3 ms
-    for 2 000 objects, 50 ms for 50 000; with 1000 UAVs, 190 ms every few minutes). Were they still
-    rarer, what closed connections leave would take hundreds of megabytes. The recorder's thread
-    yields after a millisecond, because each HTTP answer waits for the interpreter several times.
+    for 2 000 objects, 50 ms for 50 000; with 1000 UAVs, 190 ms every few minutes): until one,
+    the memory of closed connections is not freed. The recorder's thread yields after a millisecond,
+    because each HTTP answer waits for the interpreter several times.
     """
     sys.setswitchinterval(0.001)
     return_freed_memory()

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import Final
 
 BYTES_MAX: Final = 16 << 20  # bytes of all bodies being sent, each counted once; one larger is sent
+SMALL_BYTES: Final = 1 << 16  # largest body that is not abandoned: that would free too little
 
 Payload = bytes | str
 """Body of an answer, or message of a stream, whose characters are nearly all ASCII."""
@@ -41,7 +42,11 @@ class HeldBodies:
             self._release(task)
 
     def _abandon_others(self, body: Payload) -> None:
-        others = [one for one, held in self._bodies.items() if held is not body]
+        others = [
+            one
+            for one, held in self._bodies.items()
+            if held is not body and len(held) > SMALL_BYTES
+        ]
         for oldest in others:
             if self.bytes <= BYTES_MAX:
                 break

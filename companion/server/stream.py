@@ -69,7 +69,7 @@ The slots span the first half of the update interval: a hundred messages at once
 everything else. A few clients do not wait.
 """
 VERSIONS_AT_ONCE: Final = 2
-"""Versions of a topic that are being made: each holds an update. Beyond them, clients wait."""
+"""Most versions of a topic made at once, since each holds an update; later ones are skipped."""
 _EARLY: Final = 0.25
 """Fraction of its period by which a message may be early, as updates are not exact."""
 
@@ -227,7 +227,7 @@ class Stream:
                                 await websocket.send_bytes(message)
                             else:
                                 await websocket.send_text(message)
-                        del message  # which has megabytes; the next one may be seconds away
+                        del message  # of megabytes: the next one may be seconds away
                         self.sent += 1
             # A change during the sending to a slow client does not wait for another tick.
             if self._node.pipeline.updates == updates:
@@ -254,7 +254,7 @@ class Stream:
             self._being_made.add(what)
             messages[what].add_done_callback(lambda _: self._being_made.discard(what))
         task = messages[what]
-        del messages  # of megabytes, and this one may be made seconds later
+        del messages  # which are megabytes, and this one may take seconds
         try:
             return await asyncio.shield(task)  # other clients may wait for it too
         finally:

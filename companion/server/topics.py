@@ -158,24 +158,25 @@ async def body(topic: Topic, node: Node, large: LargeAnswers) -> Body:
     """
     update = node.pipeline.last_update
     beams = 0 if update is None else update.beams.weights.size
+    key = "body", topic  # a topic alone equals the key of the path of that name
     match topic:
         case Topic.UAVS:
             return await large.uavs()
         case Topic.BEAMS:
-            return await large.made(("body", topic), partial(_beams, node))
+            return await large.made(key, partial(_beams, node))
         case Topic.WEIGHTS:
             many = beams > FEW_WEIGHTS
-            return await large.made(("body", topic), partial(_weights, node), is_large=many)
+            return await large.made(key, partial(_weights, node), is_large=many)
         case Topic.RECORDS:
             many = node.pipeline.settings.records.guaranteed
-            return await large.made(("body", topic), partial(_records, node), is_large=many)
+            return await large.made(key, partial(_records, node), is_large=many)
         case Topic.STATUS:
             return _status(node)
         case Topic.LINKS:
             many = state.component_count(node) > FEW_ITEMS
-            return await large.made(("body", topic), partial(_links, node), is_large=many)
+            return await large.made(key, partial(_links, node), is_large=many)
         case Topic.FLEET:
             many = fleet_view.offer_count(node.fleet_status()) > FEW_ITEMS
-            return await large.made(("body", topic), partial(_fleet, node), is_large=many)
+            return await large.made(key, partial(_fleet, node), is_large=many)
         case Topic.EVENTS:
             return glance.events(node)

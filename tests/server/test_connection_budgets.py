@@ -14,7 +14,7 @@ import pytest
 import uvicorn
 import uvloop
 import websockets
-from http_support import Client, asked, connected, ends, served
+from http_support import Client, asked, connected, ends, get, served, upgrade
 from starlette.testclient import TestClient
 from support import HANG_S, run_async
 from uvicorn.server import ServerState
@@ -39,15 +39,7 @@ PING = b"\x89\x80\0\0\0\0"
 TOKEN = "a token of sixteen characters"
 
 
-def get(path: str, *headers: str) -> bytes:
-    lines = [f"GET {path} HTTP/1.1", "Host: 127.0.0.1", *headers]
-    return "\r\n".join([*lines, "", ""]).encode()
-
-
-UPGRADE = get(
-    "/v1/stream", "Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13",
-    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
-)  # fmt: skip
+UPGRADE = upgrade()
 
 
 # --- budgets --------------------------------------------------------------------------------------

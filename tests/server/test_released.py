@@ -12,7 +12,7 @@ from socket import SO_RCVBUF, SOL_SOCKET
 from typing import Any
 
 import pytest
-from http_support import Client, connected, ends, served
+from http_support import Client, connected, ends, get, served, upgrade
 from starlette.exceptions import HTTPException
 from support import HANG_S, run_async
 from websockets.asyncio.client import connect
@@ -60,31 +60,6 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> None:
     KEPT.clear()
     monkeypatch.setattr(stream, "Snapshot", Watched)
     monkeypatch.setattr(stream, "_task", kept)
-
-
-def get(path: str) -> bytes:
-    """A request on a connection of its own."""
-    lines = [f"GET {path} HTTP/1.1", "Host: 127.0.0.1", "Connection: close"]
-    return "\r\n".join([*lines, "", ""]).encode()
-
-
-def upgrade(query: str, *headers: str) -> bytes:
-    """A request of a stream."""
-    lines = [
-        f"GET /v1/stream?{query} HTTP/1.1", "Host: 127.0.0.1", "Connection: Upgrade",
-        "Upgrade: websocket", "Sec-WebSocket-Version: 13",
-        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", *headers,
-    ]  # fmt: skip
-    return "\r\n".join([*lines, "", ""]).encode()
-
-
-async def streaming(port: int, query: str, *headers: str) -> Client:
-    """A raw client of a stream whose handshake is done."""
-    client = await connected(port)
-    client[1].write(upgrade(query, *headers))
-    head = await asyncio.wait_for(client[0].readuntil(b"\r\n\r\n"), HANG_S)
-    assert head.startswith(b"HTTP/1.1 101")
-    return client
 
 
 def is_of(task: "asyncio.Task[Any]", name: str) -> bool:
@@ -169,7 +144,7 @@ def test_messages_of_few_updates_are_made_at_once(
                 async with connect(address, close_timeout=1):
                     for _ in range(3):
                         node.tick()
-                        await asyncio.sleep(0.02)
+                        await asyncio.sleep(0.02)  # what is refused cannot be awaited
             made = [one for one in asyncio.all_tasks() if is_of(one, "Stream._encoded")]
             assert 0 < len(made) <= stream.VERSIONS_AT_ONCE
             waiting.set()
@@ -196,7 +171,7 @@ def test_path_and_stream_of_one_name_share_no_answer(
             async def asks() -> None:
                 for _ in range(30):
                     client = await connected(port)
-                    client[1].write(get("/v1/links"))
+                    client[1].write(get("/v1/links", "Connection: close"))
                     body = await asyncio.wait_for(client[0].read(), HANG_S)
                     assert body.startswith(b"HTTP/1.1 200"), body
                     assert b'"links":[{' in body
@@ -275,6 +250,26 @@ def test_messages_held_for_slow_streams_are_limited_in_all(
 
     run_async(check())
     assert held_bodies.HELD.bytes == 0
+
+
+def test_small_bodies_are_not_abandoned_for_large_ones() -> None:
+    """It would free little: a dashboard of a few UAVs had to reconnect for those of thousands."""
+    held, sizes = held_bodies.HeldBodies(), (1000, 12 << 20, 12 << 20)
+
+    async def send(size: int, until: asyncio.Event) -> None:
+        with held.hold(bytes(size)):
+            await until.wait()
+
+    async def check() -> list[bool]:
+        until = asyncio.Event()
+        sending = [asyncio.create_task(send(size, until)) for size in sizes]
+        await asyncio.wait(sending, timeout=0.1, return_when=asyncio.FIRST_COMPLETED)
+        until.set()
+        await asyncio.wait(sending)
+        return [one.cancelled() for one in sending]
+
+    assert run_async(check()) == [False, True, False]
+    assert held.bytes == 0
 
 
 def test_stream_is_closed_with_a_reason_if_it_reads_again(make_node: Any, serving: Any) -> None:

@@ -68,7 +68,7 @@ FOLLOWED_MAX: Final = LATEST - 3650 * 24 * 60 * MINUTE
 MARGIN: Final = 5 * SECOND
 """Largest lag of a killed process's state on disk: see ``State.after_crash``."""
 PACE_WINDOW: Final = 10 * SECOND  # time over which the pace of a stream is measured
-FIRST_PACE: Final = SECOND // 2  # time after which a first pace is known
+FIRST_PACE: Final = SECOND // 2  # time over which a pace is measured at least
 COUNTING_MAX: Final = SECOND // 10  # largest pace of timestamps that count frames, units per second
 BURST: Final = SECOND
 """Upper limit on frames sent in ``MARGIN``; each takes one time unit if the clock is behind."""
@@ -150,8 +150,8 @@ START: Final = State()  # nothing received and nothing sent
 class _OpenStream:
     """A stream while its link is open: fields as in ``StoredStream``.
 
-    Its pace is measured over windows of ``PACE_WINDOW``, the first of which gives it before its end
-    as well. ``window`` is the own clock and the stream's timestamp when the current one began; None
+    Its pace is measured over windows of ``PACE_WINDOW``; during the first one, it is the largest so
+    far. ``window`` is the own clock and the stream's timestamp when the current one began; None
     until the stream is heard on this link.
     """
 
@@ -169,8 +169,9 @@ class _OpenStream:
         elapsed = clock - self.window[0]
         if elapsed >= (FIRST_PACE if self.is_first_window else PACE_WINDOW):
             pace = math.ceil((stamp - self.window[1]) * SECOND / elapsed)
-            least = self.pace or 0 if self.is_first_window else 0  # it may begin slowly
-            self.pace = max(pace, least) if pace <= COUNTING_MAX else None
+            if self.is_first_window and self.pace is not None:
+                pace = max(pace, self.pace)  # the stream may begin slowly
+            self.pace = pace if pace <= COUNTING_MAX else None
         if elapsed >= PACE_WINDOW:
             self.window, self.is_first_window = (clock, stamp), False
 

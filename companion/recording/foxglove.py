@@ -1,8 +1,8 @@
 """Live channels with a recording's messages on a WebSocket, for Foxglove and Lichtblick.
 
 Needs the package foxglove-sdk, which the extra ``live`` installs. The package's server runs on its
-own threads; messages are encoded on another thread. The event loop only queues events; events that
-a slow viewer cannot take are dropped.
+own threads; messages are encoded on another thread, for at most ``SHARE`` of the time. The event
+loop only queues events; updates and events for which that is not enough are dropped.
 """
 
 import contextlib
@@ -16,10 +16,14 @@ from companion.recording import schemas
 from companion.recording.entries import NAMED, Encoder, Geodetic
 from companion.recording.scene import Scene
 from companion.recording.schemas import Schema
-from companion.values import Estimate, Event, Output, UserError
+from companion.values import Estimate, Event, Output, Update, UserError
 from companion.values.extras import needs
 
 QUEUE_MAX: Final = 10_000  # events waiting to be sent at most
+UPDATES_MAX: Final = 2  # updates waiting at most: with many UAVs each takes megabytes
+SHARE: Final = 0.25
+"""Largest share of the time for encoding: with 1000 UAVs an update has 2000 messages."""
+TURN_S: Final = 0.002  # time of the processor after which the thread rests
 RATE_HZ: Final = 10.0  # largest rate of tracks and weights; faster changes are not visible
 LOOK_S: Final = 0.2  # time between two checks for viewers
 NAME: Final = "companion"  # name of the server in viewers
@@ -65,6 +69,8 @@ class LiveChannels:
         for topic, schema in NAMED:
             self._channel(topic, schema)
         self._queue: queue.Queue[_Item | None] = queue.Queue(QUEUE_MAX)
+        self._updates_put = self._updates_taken = 0  # by the event loop, by the thread
+        self._turn_began_s = 0.0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="foxglove", daemon=True)
 
@@ -77,10 +83,17 @@ class LiveChannels:
 
         Never blocks.
         """
+        updates = _updates_in(outputs)
+        if updates and self._updates_put - self._updates_taken >= UPDATES_MAX:
+            outputs = [one for one in outputs if not isinstance(one, Update)]
+            self.dropped += updates
+            updates = 0
         try:
             self._queue.put_nowait((event, outputs))
         except queue.Full:
             self.dropped += 1
+        else:
+            self._updates_put += updates
 
     def stop(self) -> None:
         """Stop the live server."""
@@ -92,6 +105,7 @@ class LiveChannels:
         self._server.stop()
 
     def _run(self) -> None:
+        self._turn_began_s = time.thread_time()
         watched, look_due_s = False, 0.0
         while not self._stopping.is_set():
             item = self._queue.get()
@@ -101,6 +115,7 @@ class LiveChannels:
             if item is None:
                 continue
             event, outputs = item
+            self._updates_taken += _updates_in(outputs)
             self._announce(outputs)
             if not watched:
                 continue
@@ -108,6 +123,7 @@ class LiveChannels:
                 self._encoder.event(event)
             for output in outputs:
                 self._encoder.output(output, self._geodetic)
+            del item, event, outputs  # of megabytes, until the next one
 
     def _announce(self, outputs: Sequence[Output]) -> None:
         """Announce the topics of each new UAV: viewers can subscribe only to announced topics."""
@@ -120,6 +136,11 @@ class LiveChannels:
     def _send(self, topic: str, schema: Schema, t_ns: int, data: bytes) -> None:
         channel = self._channels.get(topic) or self._channel(topic, schema)
         channel.log(data, log_time=max(0, t_ns))
+        now_s = time.thread_time()
+        worked_s = now_s - self._turn_began_s
+        if worked_s >= TURN_S:
+            self._stopping.wait(worked_s * (1 / SHARE - 1))
+            self._turn_began_s = now_s
 
     def _channel(self, topic: str, schema: Schema) -> Any:
         described = self._foxglove.Schema(
@@ -129,6 +150,10 @@ class LiveChannels:
             topic, schema=described, message_encoding="protobuf", context=self._context
         )
         return self._channels.setdefault(topic, channel)
+
+
+def _updates_in(outputs: Sequence[Output]) -> int:
+    return sum(isinstance(one, Update) for one in outputs)
 
 
 def _foxglove() -> Any:

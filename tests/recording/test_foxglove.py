@@ -7,7 +7,12 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
+import time
+import weakref
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -19,6 +24,7 @@ from support import HANG_S, run_async
 from websockets.asyncio.client import ClientConnection, connect
 
 from companion.beams.array.geometry import uniform_linear
+from companion.recording import foxglove
 from companion.recording.foxglove import LiveChannels
 from companion.recording.scene import Scene
 from companion.values import Estimate, FloatArray, Tick, Update, UserError
@@ -102,7 +108,53 @@ def test_viewer_receives_the_channels_of_a_recording(
     assert found["/tracks"][1].uav in ("1:1", "icao:4CA7B3")
     assert [entity.id for entity in found["/scene"][1].entities] == ["uav 1:1", "uav icao:4CA7B3"]
     assert len(found["/beams/weights"][1].weights_complex64) == 4 * 2 * 8
-    assert live.dropped == 0
+
+
+def with_own_weights(update: Update) -> Update:
+    """The same update with weights of its own, as each has in flight."""
+    return replace(update, beams=replace(update.beams, weights=update.beams.weights.copy()))
+
+
+def test_updates_that_wait_are_dropped_and_the_events_are_not(
+    geodetic: Geodetic, update: Callable[[int], Update], estimate: Estimate
+) -> None:
+    live = LiveChannels(host="127.0.0.1", port=0, geodetic=geodetic, scene=None)
+    updates = [with_own_weights(update(START_NS + n)) for n in range(9)]
+    held = [weakref.ref(one.beams.weights) for one in updates]
+    for one in updates:  # its thread does not run yet
+        live.put(Tick(one.t_ns), [estimate, one])
+    del updates, one
+    assert live.dropped == 7
+    kept = [weights for ref in held if (weights := ref()) is not None]
+    assert len(kept) == 2
+    released = [threading.Event() for _ in kept]
+    for weights, event in zip(kept, released, strict=True):
+        weakref.finalize(weights, event.set)
+    del kept, weights
+    try:
+        live.start()
+        assert all(event.wait(HANG_S) for event in released)
+        live.put(Tick(START_NS + 10), [update(START_NS + 10)])
+        assert live.dropped == 7
+    finally:
+        live.stop()
+
+
+def test_encoding_rests_most_of_the_time(
+    monkeypatch: pytest.MonkeyPatch, geodetic: Geodetic, update: Callable[[int], Update]
+) -> None:
+    live = LiveChannels(host="127.0.0.1", port=0, geodetic=geodetic, scene=None, rate_hz=None)
+    rests, used_s = list[float](), count(0.0, 0.001)
+    monkeypatch.setattr(time, "thread_time", lambda: next(used_s))
+    monkeypatch.setattr(live._stopping, "wait", rests.append)
+    try:
+        for n in range(30):
+            live._encoder.output(update(START_NS + n), geodetic)
+    finally:
+        live.stop()
+    worked_s = next(used_s)
+    assert len(rests) > 20
+    assert worked_s <= 1.05 * foxglove.SHARE * (worked_s + sum(rests))
 
 
 def test_port_in_use_is_reported(geodetic: Geodetic) -> None:

@@ -22,6 +22,7 @@ from companion.mavlink.links.endpoints import Address, Upcalls, bound, settle
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.to_loop import SLICE_S
 from companion.mavlink.links.urls import LinkUrl
+from companion.mavlink.trust.newcomers import LATE_NS
 
 RECEIVE_BUFFER_BYTES: Final = 4 << 20
 """Requested receive buffer; with default buffers, frames are lost above about 20 000 a second.
@@ -35,6 +36,14 @@ STALE_NS: Final = 2_000_000_000
 """Age at which a datagram is discarded: a busy machine then processes new data, not a backlog."""
 READ_AT_ONCE: Final = 32
 """Most datagrams read before other work runs, as in libuv; ``SLICE_S`` limits them too."""
+LATE_READ_AT_ONCE: Final = 1024  # the same while datagrams are late
+LATE_SHARE: Final = 0.5
+"""Time slice while datagrams are late, in proportion to the time that other work took before it.
+
+With ``SLICE_S`` in each iteration of an event loop that other work keeps busy for 50 ms, links
+would have 2 % of the time.
+"""
+LATE_SLICE_MAX_S: Final = 0.005  # longest such time slice
 WAITING_PEERS_MAX: Final = 64  # peers whose datagrams wait; with more, nothing is read
 WAITING_MAX_BYTES: Final = 1 << 18  # bytes of a peer that wait; datagrams beyond it are dropped
 
@@ -227,6 +236,8 @@ class _Datagrams:
         self._dropped = 0
         self._stale = 0
         self._unchecked = 0
+        self._is_late = False  # whether the newest datagram was
+        self._ended_s = 0.0  # when reading last ended
 
     async def serve(self) -> None:
         """Read until the socket must be recreated; raise the exceptions of ``take``."""
@@ -263,20 +274,32 @@ class _Datagrams:
         return _fullness(self._socket)
 
     def _read(self) -> None:
+        most, slice_s = READ_AT_ONCE, SLICE_S
+        if self._is_late:
+            others_s = time.monotonic() - self._ended_s
+            most = LATE_READ_AT_ONCE
+            slice_s = max(SLICE_S, min(LATE_SLICE_MAX_S, LATE_SHARE * others_s))
+        if len(self._waiting) < WAITING_PEERS_MAX:
+            self._read_some(most, slice_s)
+        self._ended_s = time.monotonic()
+
+    def _read_some(self, most: int, slice_s: float) -> None:
         was_set = self._wall_clock.was_set()
-        until_s = time.thread_time() + SLICE_S  # waits for the interpreter do not count
-        for _ in range(READ_AT_ONCE if len(self._waiting) < WAITING_PEERS_MAX else 0):
+        until_s = time.thread_time() + slice_s  # waits for the interpreter do not count
+        for _ in range(most):
             if time.thread_time() > until_s:
                 return
             try:
                 data, stamp_ns, address = self._next()
             except (BlockingIOError, InterruptedError):
                 self._wall_clock.note()
+                self._is_late = False
                 return
             except OSError as error:
                 self._note_error(error)
                 return
             age_ns = self._age_ns(stamp_ns, was_set)
+            self._is_late = age_ns is not None and age_ns > LATE_NS
             if age_ns is not None and age_ns > STALE_NS:
                 self._stale += 1
                 continue

@@ -396,7 +396,8 @@ class Senders:
         if refused is not None:
             return _refused(report, refused)
         clock = (sender.shared or sender).clock
-        stamp, said = self._stamp(clock, uav, t_ns, boot_ms, doubt_ns)
+        late_ns = self._late_ns(frame, clock) if kind is UavKind.REMOTE_ID else 0
+        stamp, said = self._stamp(clock, uav, t_ns, boot_ms, doubt_ns, late_ns=late_ns)
         said = (*switched, *said)
         before_ns = sender.stamped_ns
         if not doubt_ns:
@@ -443,6 +444,11 @@ class Senders:
             limits=assumed.limits,
         )
         return FrameOutcome(message=placed, outputs=said, restarted=restarted, change=clock.change)
+
+    def _late_ns(self, frame: Frame, clock: SenderClock) -> int:
+        """Return how late an aircraft's first report may be, since others of its receiver are."""
+        late_s = 0.0 if clock.reading() else self._dedupe.least_age_s(frame)
+        return round(late_s * 1e9) if late_s > RELAYED_DELAY_S else 0
 
     def _unplaced(self, sender: Sender, report: Report, said: tuple[Notice, ...]) -> FrameOutcome:
         """Reject a report whose stamp fits no clock; its stamps may have another unit."""
@@ -622,10 +628,17 @@ class Senders:
     # --- times ------------------------------------------------------------------------------
 
     def _stamp(
-        self, clock: SenderClock, name: str, arrival_ns: int, boot_ms: int, doubt_ns: int = 0
+        self,
+        clock: SenderClock,
+        name: str,
+        arrival_ns: int,
+        boot_ms: int,
+        doubt_ns: int = 0,
+        *,
+        late_ns: int = 0,
     ) -> tuple[Stamp | None, tuple[Notice, ...]]:
         """Place a stamp on the sender's timeline; return a notice if the stamp shows a reboot."""
-        stamp = clock.observe(arrival_ns, boot_ms, doubt_ns)
+        stamp = clock.observe(arrival_ns, boot_ms, doubt_ns, late_ns=late_ns)
         if stamp is None or not stamp.rebooted:
             return stamp, ()
         if kind_of(name).reports_itself and (source := Source.parse(name)) in self._components:

@@ -52,6 +52,8 @@ RESUME_BATCH: Final = 2000
 """Events written at once when a recording continues: some hundred kilobytes."""
 INDEX_MAX_BYTES: Final = 8 << 20
 """Size of a part's index, which is kept in memory until its end, at which a new part begins."""
+CHANNELS_MAX: Final = 20_000
+"""Topics of a part after which a new one begins, as each UAV has its own: MCAP allows 65 535."""
 MIN_FREE_BYTES: Final = 8 << 20
 """Free space needed to continue a recording; with less, it would soon stop again."""
 
@@ -62,7 +64,8 @@ _TOO_SLOW: Final = "the disk was too slow"
 class Rotation:
     """When a new part of a recording begins: at a size in bytes or after seconds; None: never.
 
-    One that has either limit also begins when the index of a part reaches ``INDEX_MAX_BYTES``.
+    One that has either limit also begins when the index of a part reaches ``INDEX_MAX_BYTES``; any
+    at ``CHANNELS_MAX`` topics.
     """
 
     size_bytes: float | None = None
@@ -129,6 +132,7 @@ class BackgroundRecorder:
         self._put_bytes = self._freed_bytes = 0  # of updates; each is counted on one thread
         self._missed = 0
         self._overrun = False
+        self._has_ended = False  # by a defect
         self._unflushed: list[_Item] = []  # written, but not yet flushed to the disk
         self._clock_set: ClockSet | None = None
         self._lost = 0  # events that may or may not be on the disk
@@ -160,6 +164,9 @@ class BackgroundRecorder:
         Once the queue is full, nothing is accepted until half of it is written: one long gap can be
         reported, a thousand short ones would make the recording useless.
         """
+        if self._has_ended:
+            self.dropped += 1
+            return
         if self._overrun and len(self._queue) <= self._queue_max // 2:
             self._overrun = False
             self._tell(Severity.INFO, f"recording again: {self._missed} events are missing")
@@ -258,6 +265,16 @@ class BackgroundRecorder:
         return self._folder if self._open is None else self._open.path
 
     def _run(self) -> None:
+        try:
+            self._write_parts()
+        except Exception as defect:  # must not end the recording silently
+            self.failure = f"{self._where}: {type(defect).__name__}: {defect}"
+            self._tell(Severity.ERROR, f"nothing is recorded any more: {self.failure}")
+            self._has_ended = True
+            self._give_up()
+            raise
+
+    def _write_parts(self) -> None:
         tried = False  # whether writing was tried again since the stop
         while self._open is None or not self._record():
             if tried:
@@ -304,7 +321,8 @@ class BackgroundRecorder:
                 item = self._queue.popleft()
                 self._unflushed.append(item)
                 self._write(item)
-            if time.monotonic() >= flush_due_s or len(self._unflushed) >= self._queue_max:
+            is_full = len(self._unflushed) >= self._queue_max or self._has_many_channels()
+            if is_full or time.monotonic() >= flush_due_s:
                 self._flush()
                 self._rotate_if_due()
                 every_s = min(2 * every_s, FLUSH_S)
@@ -351,10 +369,13 @@ class BackgroundRecorder:
         large = size_bytes is not None and self.bytes >= size_bytes
         old = after_s is not None and time.monotonic() - self._begun_s >= after_s
         indexed = self._rotation != NEVER and self._writer.index_bytes >= INDEX_MAX_BYTES
-        if self._writer.flushed and (large or old or indexed):
+        if self._writer.flushed and (large or old or indexed or self._has_many_channels()):
             self._writer.close({}, is_continued=True)
             self.bytes = self._writer.size_bytes  # also if the next part cannot be opened
             self._open_next()
+
+    def _has_many_channels(self) -> bool:
+        return self._writer.channels >= CHANNELS_MAX
 
     def _open_next(self) -> None:
         """Open the next part, or the same part again if none of it is on the disk."""

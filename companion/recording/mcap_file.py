@@ -7,6 +7,7 @@ records are written with the library. Reading uses the library.
 Layout: https://mcap.dev/spec.
 """
 
+import errno
 import struct
 import zlib
 from collections.abc import Mapping
@@ -37,6 +38,7 @@ from companion.recording.container import MAGIC
 CHUNK_BYTES: Final = 1 << 20  # size of its contents at which a chunk ends
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
 """Layout of a message: opcode, body length, channel, sequence, log time, publish time."""
+CHANNELS_MAX: Final = 0xFFFF
 _FIELDS: Final = _MESSAGE.size - 9  # size of a message's head, without opcode and length
 _INDEX: Final = struct.Struct("<BQHI")  # opcode, length, channel, length of the entries
 _FOOTER_START: Final = struct.Struct("<BQQQ")  # the part of the footer that its checksum covers
@@ -87,8 +89,10 @@ class McapFile:
     def channel(
         self, topic: str, encoding: str, schema_id: int, metadata: Mapping[str, str] | None = None
     ) -> int:
-        """Add a channel. Returns its id."""
+        """Add a channel. Returns its id. Raises ``OSError`` beyond the largest id, 65 535."""
         number = len(self._channels) + 1
+        if number > CHANNELS_MAX:
+            raise OSError(errno.EFBIG, f"a file has at most {CHANNELS_MAX} topics")
         channel = Channel(
             id=number,
             topic=topic,
@@ -205,6 +209,11 @@ class McapFile:
     def index_bytes(self) -> int:
         """Size of the chunks' index, which is kept in memory until the end."""
         return len(self._chunk_indexes)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels so far."""
+        return len(self._channels)
 
     def finish(self) -> None:
         """End the current chunk, and write the summary and the footer."""

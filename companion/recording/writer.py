@@ -138,6 +138,11 @@ class Writer:
         return self._mcap.index_bytes
 
     @property
+    def channels(self) -> int:
+        """Number of the file's topics."""
+        return self._mcap.channels
+
+    @property
     def path(self) -> Path:
         """Current path of the file: ``….mcap.active`` until it is closed."""
         return self._final if self._finished else _beside(self._final)

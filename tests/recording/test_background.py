@@ -701,6 +701,42 @@ def test_large_index_ends_a_part_unless_parts_have_no_end(
     assert len(parts_of(tmp_path)) == (1 if rotation == Rotation() else 2)
 
 
+@pytest.mark.parametrize("rotation", [Rotation(1e9, None), Rotation()])
+def test_many_topics_end_any_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rotation: Rotation
+) -> None:
+    monkeypatch.setattr(background, "CHANNELS_MAX", 1)
+    made = recorder(tmp_path, rotation)
+    made.start()
+    events = hand_over(made, ticks(0, 10))
+    wait_for_part(made, 2)
+    events += hand_over(made, ticks(10, 20))
+    made.stop({})
+    logs = parts_of(tmp_path)
+    assert len(logs) >= 2 and list(log_events(logs, Settings())) == events
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_defect_that_ends_the_recording_is_announced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise ValueError("a defect")
+
+    made = recorder(tmp_path)
+    monkeypatch.setattr(Writer, "event", broken)
+    made.start()
+    hand_over(made, ticks(0, 10))
+    wait_until(lambda: not made._thread.is_alive())
+    assert made.degraded and "a defect" in str(made.failure) and made.dropped == 10
+    (first, last) = (text for _, text in made.news())
+    assert first.startswith("nothing is recorded any more") and "last 10 events" in last
+    hand_over(made, ticks(10, 20))
+    assert (made.dropped, made.queued) == (20, 0)
+    made.stop({})
+    made._writer.salvage()
+
+
 @pytest.mark.parametrize("rotation", [Rotation(1.0, None), Rotation(None, 0.5)])
 def test_new_part_continues_where_the_previous_ends(tmp_path: Path, rotation: Rotation) -> None:
     made = recorder(tmp_path, rotation)

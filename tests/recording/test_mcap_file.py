@@ -90,3 +90,14 @@ def test_index_of_many_channels_takes_its_bytes_in_memory() -> None:
         tracemalloc.stop()
     assert made.index_bytes > 41 * 500 * 10
     assert grown < 1.5 * made.index_bytes
+
+
+def test_more_topics_than_channel_ids_are_an_error_of_the_file(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(mcap_file, "CHANNELS_MAX", 2)
+    file = McapFile(io.BytesIO())
+    assert [file.channel(topic, "protobuf", 0) for topic in "ab"] == [1, 2]
+    with pytest.raises(OSError, match="at most 2 topics"):
+        file.channel("c", "protobuf", 0)
+    file.finish()

@@ -71,15 +71,22 @@ class SenderClock:
         self._gnss_plausible = 0
         self._latency_s = 0.0
         self._doubt_ns = 0  # largest doubt of all stamps
+        self._drift_max = drift_max
+        self._late_first: tuple[int, float] | None = None
+        """Sender time of the line's first stamp if that may have been late, and least offset."""
         self._known: tuple[ClockKind, int, int, int] | None = None  # at the newest stamp
         self._reading: ClockReading | None = None
 
-    def observe(self, arrival_ns: int, boot_ms: int, doubt_ns: int = 0) -> Stamp | None:
+    def observe(
+        self, arrival_ns: int, boot_ms: int, doubt_ns: int = 0, *, late_ns: int = 0
+    ) -> Stamp | None:
         """Place a stamp whose frame may have arrived up to ``doubt_ns`` earlier.
 
+        ``late_ns`` is how late the first stamp may be, since all others of its route are as late.
         Returns None for a frame of the previous boot, and for a stamp off the line that is not yet
         confirmed by others: that report has no time and cannot be used.
         """
+        hidden_ns = self._hidden_ns()
         placed = self._line.observe(arrival_ns, boot_ms)
         self.change = self._known = self._reading = None
         # A stamp without a place may start a line that later ones confirm, and be its floor.
@@ -90,6 +97,9 @@ class SenderClock:
             self._timesync.clear()
             self.forget_gnss()
         line, x_ns = self._line, placed.x_ns
+        late_ns = hidden_ns if placed.rebooted else late_ns
+        if late_ns:
+            self._late_first = x_ns, line.floor.heights(x_ns).upper_bound - late_ns
         if placed.ahead_ns:
             self._note_earlier(placed.ahead_ns)
         elif placed.jump_ns or line.floor.rise_ns or line.floor.jump_ns:
@@ -102,6 +112,22 @@ class SenderClock:
         return Stamp(
             sender_ns=x_ns, latency_s=latency_s, rebooted=placed.rebooted, oldest_ns=at_ns + low_ns
         )
+
+    def _hidden_ns(self) -> int:
+        """Return how late all stamps of the line may be, as its first one was; 0 if it was not."""
+        if self._late_first is None:
+            return 0
+        newest_ns = self._line.newest_ns
+        return max(
+            0, round(self._line.floor.heights(newest_ns).upper_bound - self._least_ns(newest_ns))
+        )
+
+    def _least_ns(self, x_ns: int) -> float:
+        """Return the least offset at a sender time, if the line's first stamp was late."""
+        if self._late_first is None:
+            return math.inf
+        first_ns, least_ns = self._late_first
+        return least_ns - self._drift_max * abs(x_ns - first_ns)
 
     def may_be_own(self, arrival_ns: int, boot_ms: int, late_ns: int = _MAX_DEPTH_NS) -> bool:
         """Return whether a stamp that arrived by ``arrival_ns`` may be this clock's, so late."""
@@ -286,7 +312,8 @@ class SenderClock:
         sure_ns, highest_ns, line_ns, least_ns = floor.heights(x_ns)
         median_ns, delay_ns, best = floor.median_ns, self._constant_delay_ns, ClockKind.ENVELOPE
         low_ns = least_ns - max(delay_ns, median_ns, MIN_INVISIBLE_NS) - floor.residual_ns()
-        low_ns = max(low_ns - self._doubt_ns, sure_ns - _MAX_DEPTH_NS)
+        low_ns = min(low_ns - self._doubt_ns, self._least_ns(x_ns))
+        low_ns = max(low_ns, sure_ns - _MAX_DEPTH_NS)
         high_ns: float = sure_ns - delay_ns
         likely_ns = line_ns - delay_ns - INVISIBLE_RATIO * max(0.0, median_ns - delay_ns)
         rise_ns = highest_ns - sure_ns

@@ -219,6 +219,8 @@ class Peers:
         for item, kept in zip(found, checked or found, strict=True):
             if isinstance(item, Rejection):
                 self.count_lost(item.reason, item.count)
+                if item.reason is Reason.REPLAYED:  # its sender learns the time from our frames
+                    peer.heard_ns = item.t_ns
                 continue
             t_ns, _, source, msgid, raw, _ = item
             if raw[0] == MAGIC_V2:

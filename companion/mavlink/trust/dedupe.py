@@ -5,6 +5,7 @@ of it, since every link has its own. GLOBAL_POSITION_INT carries a boot time, so
 the same report. ADSB_VEHICLE carries none: ``adsb`` detects repeats there.
 """
 
+import math
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Final
@@ -55,6 +56,7 @@ class _Lateness:
     newest_ns    newest arrival of a report, or of a repeat
     latencies_s  largest latencies
     doubt_s      how much larger the newest one may be
+    ages_s       least of the largest ages that reports may have had on arrival
     intervals_ns least intervals between arrivals
     """
 
@@ -62,6 +64,7 @@ class _Lateness:
     newest_ns: int
     latencies_s: tuple[float, float]
     doubt_s: float
+    ages_s: tuple[float, float] = math.inf, math.inf
     intervals_ns: tuple[int, int] = LATE_KEPT_NS, LATE_KEPT_NS
 
 
@@ -115,6 +118,17 @@ class Dedupe:
         overdue_s = min(max(0, overdue_ns), LATE_MAX_NS) * 1e-9
         return max(known.latencies_s) + known.doubt_s + overdue_s
 
+    def least_age_s(self, frame: Frame) -> float:
+        """Return how old the reports of a frame's system may all be on arrival, over its link.
+
+        0 if there was none in the last ``LATE_KEPT_NS``, or the first one came less than
+        ``SLOT_NS`` ago: clocks are not known so soon.
+        """
+        known = self._lateness.get((frame.link, frame.source.sysid))
+        if known is None or frame.t_ns - known.newest_ns > LATE_KEPT_NS:
+            return 0.0
+        return min(known.ages_s) if known.ages_s[1] < math.inf else 0.0
+
     def _note(self, of: tuple[str, int], t_ns: int, latency_s: float, doubt_s: float) -> None:
         """Note the latency of a report. Short expressions stand for calls: this runs for each."""
         known = self._lateness.get(of)
@@ -125,12 +139,17 @@ class Dedupe:
                 )
             return
         known.doubt_s = doubt_s
+        age_s = latency_s + doubt_s
         if t_ns - known.since_ns > SLOT_NS:
             known.since_ns = t_ns
             known.latencies_s = latency_s, known.latencies_s[0]
+            known.ages_s = age_s, known.ages_s[0]
             known.intervals_ns = LATE_KEPT_NS, known.intervals_ns[0]
-        elif latency_s > known.latencies_s[0]:
-            known.latencies_s = latency_s, known.latencies_s[1]
+        else:
+            if latency_s > known.latencies_s[0]:
+                known.latencies_s = latency_s, known.latencies_s[1]
+            if age_s < known.ages_s[0]:
+                known.ages_s = age_s, known.ages_s[1]
         interval_ns, known.newest_ns = t_ns - known.newest_ns, t_ns
         if interval_ns < known.intervals_ns[0]:
             known.intervals_ns = interval_ns, known.intervals_ns[1]

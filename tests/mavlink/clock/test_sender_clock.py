@@ -628,3 +628,18 @@ def test_evidence_above_the_floor_is_a_step_with_infinite_drift(
     change = clock.change
     assert change is not None and change.proven
     assert (change.step_s, change.drift_ppm) == pytest.approx((0.12, math.inf))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_first_stamp_that_may_be_late_leaves_the_truth_within_the_bound(seed: int) -> None:
+    """All stamps are 2 s late, then a reboot, then all are in time."""
+    clock, drift = SenderClock(), 50e-6
+    for before, late_s in ((0, 2.0), (100, 2.0), (200, 0.0)):
+        for arrival_ns, boot_ms in wifi(seed, drift, 60):
+            at_ns, late_ns = arrival_ns + before * S + round(late_s * S), round(2.1 * S)
+            stamp_ms = boot_ms - 7_000_000 * (before == 100) + 1000 * before
+            clock.observe(at_ns, stamp_ms, late_ns=0 if clock.reading() else late_ns)
+        seen = known(clock)
+        true_ns = truth(drift, boot_ms * MS) + before * S - stamp_ms * MS
+        assert -seen.before_s <= (seen.offset_ns - true_ns) * 1e-9 - 1e-3 <= seen.after_s
+        assert not late_s or seen.uncertainty_s < 2.3

@@ -175,6 +175,14 @@ def test_rejections_are_counted_by_reason_without_other_effect() -> None:
     assert peer.heard_ns is None and heard.peers.active_since(0) == []
 
 
+def test_peer_of_replayed_frames_gets_messages_by_which_its_sender_learns_the_time() -> None:
+    heard = Heard()
+    replayed = Rejection(t_ns=5, source="1:1", reason=Reason.REPLAYED)
+    heard.peers.count(heard.peers.at("a"), [replayed])
+    assert [peer.key for peer in heard.peers.active_since(5)] == ["a"]
+    assert heard.peers.route_to(UAV) is None and heard.status.frames == 0
+
+
 def test_source_is_located_at_the_peer_last_received_from() -> None:
     heard = Heard().hear([1], "a").hear([1], "b").hear([1], "c", Source(2, 1))
     peers = heard.peers

@@ -14,6 +14,7 @@ from companion.cli.console import (
     FiniteRange,
     Progress,
     print_log_notices,
+    say,
 )
 from companion.cli.output import write_file
 from companion.values import WeightFormat
@@ -66,7 +67,7 @@ def weights(
     Example: companion weights flight.tlog --at 120 --center 5:1 --format npy --out w.npy
     """
     from companion.node import moment
-    from companion.node.replay import settings_for
+    from companion.node.replay import missing, settings_for
     from companion.pipeline import assembly
     from companion.views import beam_state, weight_formats
 
@@ -79,6 +80,8 @@ def weights(
     settings = settings_for(logs, config, center)
     progress.clear()
     print_log_notices(logs)
+    for line in missing(logs):
+        say(line, err=True)
     equipment = assembly.equipment(settings, assembly.array(settings))
     pipeline, update = moment.look(
         logs,

@@ -219,7 +219,7 @@ class Stream:
                     if said.get(topic) != version:
                         try:
                             message = await self._message(topic, asked.uavs, version)
-                        except HTTPException:  # too much is being made: with the next update
+                        except HTTPException:  # too much is being made: with the next message
                             continue
                         said[topic] = version
                         with HELD.hold(message):

@@ -183,6 +183,25 @@ def test_utc_is_that_of_the_clock_as_last_set(tmp_path: Path, cut_log: Path) -> 
     assert f"the log begins at {start}Z" in mistake(log, at=f"{before}Z")
 
 
+def test_missing_parts_of_a_recording_are_named(tmp_path: Path, cut_log: Path) -> None:
+    events: list[Event] = list(log_events([cut_log], Settings()))
+    writer = Writer(
+        where=tmp_path / "b.mcap",
+        settings_toml=Settings().to_toml(),
+        versions={},
+        weights_hz=None,
+        started_ns=events[0].t_ns,
+        part=Part.first().after("a.mcap"),
+    )
+    for event in events:
+        writer.event(event)
+    log = writer.close({})
+    command = ["weights", str(log), "--at", str(AT_S), *CENTER]
+    answer = CliRunner().invoke(main, command)
+    assert answer.exit_code == 0
+    assert answer.stderr == f"{log}: part 1 of the run is missing\n"
+
+
 @pytest.mark.parametrize(
     ("at", "said"),
     [

@@ -86,7 +86,7 @@ class SenderClock:
         Returns None for a frame of the previous boot, and for a stamp off the line that is not yet
         confirmed by others: that report has no time and cannot be used.
         """
-        hidden_ns = self._hidden_ns()
+        hidden_ns = 0 if self._late_first is None else self._hidden_ns()
         placed = self._line.observe(arrival_ns, boot_ms)
         self.change = self._known = self._reading = None
         # A stamp without a place may start a line that later ones confirm, and be its floor.
@@ -114,18 +114,15 @@ class SenderClock:
         )
 
     def _hidden_ns(self) -> int:
-        """Return how late all stamps of the line may be, as its first one was; 0 if it was not."""
-        if self._late_first is None:
-            return 0
+        """Return how late all stamps of the line may be, as its first one was."""
         newest_ns = self._line.newest_ns
         return max(
             0, round(self._line.floor.heights(newest_ns).upper_bound - self._least_ns(newest_ns))
         )
 
     def _least_ns(self, x_ns: int) -> float:
-        """Return the least offset at a sender time, if the line's first stamp was late."""
-        if self._late_first is None:
-            return math.inf
+        """Return the least offset at a sender time; the line's first stamp may have been late."""
+        assert self._late_first is not None
         first_ns, least_ns = self._late_first
         return least_ns - self._drift_max * abs(x_ns - first_ns)
 
@@ -312,7 +309,9 @@ class SenderClock:
         sure_ns, highest_ns, line_ns, least_ns = floor.heights(x_ns)
         median_ns, delay_ns, best = floor.median_ns, self._constant_delay_ns, ClockKind.ENVELOPE
         low_ns = least_ns - max(delay_ns, median_ns, MIN_INVISIBLE_NS) - floor.residual_ns()
-        low_ns = min(low_ns - self._doubt_ns, self._least_ns(x_ns))
+        low_ns -= self._doubt_ns
+        if self._late_first is not None:
+            low_ns = min(low_ns, self._least_ns(x_ns))
         low_ns = max(low_ns, sure_ns - _MAX_DEPTH_NS)
         high_ns: float = sure_ns - delay_ns
         likely_ns = line_ns - delay_ns - INVISIBLE_RATIO * max(0.0, median_ns - delay_ns)

@@ -22,6 +22,7 @@ from companion.mavlink.clock.sender_clock import SenderClock
 from companion.mavlink.trust.admission import admission
 from companion.mavlink.trust.adsb import Aircraft
 from companion.mavlink.trust.dedupe import Dedupe, LinkShare
+from companion.mavlink.trust.path_lateness import PathLateness
 from companion.mavlink.trust.remote_id import RemoteIds
 from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE, GPS2_RAW, gnss_heading, second_has_fix
 from companion.mavlink.wire.decode import ATTITUDE, decode
@@ -175,6 +176,7 @@ class Senders:
     ) -> None:
         self.aircraft = Aircraft()  # by ICAO address, over all relays
         self.remote_ids = RemoteIds()  # by radio address, for each receiver
+        self._receivers = PathLateness()  # of Remote ID, by link and sender
         self._carrier = carrier
         self._carrier_source = None if carrier is None else Source.parse(carrier)
         self._records = records
@@ -372,10 +374,13 @@ class Senders:
             sender.clock.forget_gnss()
             (sender.shared or sender).clock.forget_gnss()
 
-    def _telemetry(self, report: Report, frame: Frame) -> FrameOutcome:
+    def _telemetry(
+        self, report: Report, frame: Frame, *, late_ns: int | None = None
+    ) -> FrameOutcome:
         """Place a report in time by its stamp; noise bounds only for a vehicle that reports itself.
 
-        The arrival of ``frame`` is uncertain if another node shared it.
+        The arrival of ``frame`` is uncertain if another node shared it. ``late_ns`` as in
+        ``SenderClock.observe``.
         """
         uav, t_ns, boot_ms, doubt_ns = report.uav, report.t_ns, report.boot_ms, frame.doubt_ns
         assert boot_ms is not None
@@ -396,7 +401,6 @@ class Senders:
         if refused is not None:
             return _refused(report, refused)
         clock = (sender.shared or sender).clock
-        late_ns = self._late_ns(frame, clock) if kind is UavKind.REMOTE_ID else 0
         stamp, said = self._stamp(clock, uav, t_ns, boot_ms, doubt_ns, late_ns=late_ns)
         said = (*switched, *said)
         before_ns = sender.stamped_ns
@@ -444,11 +448,6 @@ class Senders:
             limits=assumed.limits,
         )
         return FrameOutcome(message=placed, outputs=said, restarted=restarted, change=clock.change)
-
-    def _late_ns(self, frame: Frame, clock: SenderClock) -> int:
-        """Return how late an aircraft's first report may be, since others of its receiver are."""
-        late_s = 0.0 if clock.reading() else self._dedupe.least_age_s(frame)
-        return round(late_s * 1e9) if late_s > RELAYED_DELAY_S else 0
 
     def _unplaced(self, sender: Sender, report: Report, said: tuple[Notice, ...]) -> FrameOutcome:
         """Reject a report whose stamp fits no clock; its stamps may have another unit."""
@@ -583,7 +582,17 @@ class Senders:
             return _refused(named, Reason.DUPLICATE)
         if named.boot_ms is None:
             return _refused(named, Reason.UNPLACED_STAMP)
-        return self._telemetry(named, frame)
+        path = frame.link, frame.source
+        late_s = self._receivers.largest_s(path, frame.t_ns)
+        late_ns = None if late_s is None else round(late_s * 1e9)
+        outcome = self._telemetry(named, frame, late_ns=late_ns)
+        sender = self._senders.get(named.uav)
+        reading = sender.clock.reading() if sender and sender.clock.is_settled else None
+        if outcome.message is not None and reading is not None:
+            low_ns, _, likely_ns = reading.offset_ns
+            doubt_s = (likely_ns - low_ns) * 1e-9
+            self._receivers.note(path, frame.t_ns, reading.latency_s, doubt_s)
+        return outcome
 
     def _attitude(self, attitude: Attitude) -> FrameOutcome:
         carrier = str(attitude.source)
@@ -635,7 +644,7 @@ class Senders:
         boot_ms: int,
         doubt_ns: int = 0,
         *,
-        late_ns: int = 0,
+        late_ns: int | None = None,
     ) -> tuple[Stamp | None, tuple[Notice, ...]]:
         """Place a stamp on the sender's timeline; return a notice if the stamp shows a reboot."""
         stamp = clock.observe(arrival_ns, boot_ms, doubt_ns, late_ns=late_ns)

@@ -125,6 +125,7 @@ class BackgroundRecorder:
         self._folder = folder
         self._part = Part.first()
         self._begun_s = self._flushed_s = time.monotonic()
+        self._watched_s = self._resumed_s = self._begun_s
         self._is_stalled = False
         self._finished_messages = 0  # messages in earlier parts
         self._queue: deque[_Item] = deque()  # bounded by ``put``, which never blocks
@@ -244,7 +245,11 @@ class BackgroundRecorder:
     def _watch_for_stall(self) -> None:
         """Publish a notice when the disk does not answer, and when it does again."""
         is_waiting = bool(self._queue or self._unflushed) and self.failure is None
-        waited_s = time.monotonic() - self._flushed_s
+        now_s = time.monotonic()
+        if now_s - self._watched_s > STALLED_S / 2:  # the process was stopped meanwhile
+            self._resumed_s = now_s
+        self._watched_s = now_s
+        waited_s = now_s - max(self._flushed_s, self._resumed_s)
         was_stalled, self._is_stalled = self._is_stalled, is_waiting and waited_s > STALLED_S
         if self._is_stalled and not was_stalled:
             text = f"the disk has not answered for {STALLED_S:.0f} s; events wait in memory"

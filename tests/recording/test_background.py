@@ -319,6 +319,30 @@ def test_disk_that_does_not_answer_is_announced_and_that_it_does_again(
     made.stop({})
 
 
+def test_time_for_which_the_process_was_stopped_is_none_of_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, answers = recorder(tmp_path), threading.Event()
+    flush, monotonic, passed_s = made._writer.flush, time.monotonic, 0.0
+
+    def waits() -> None:
+        assert answers.wait(HANG_S)
+        flush()
+
+    monkeypatch.setattr(made._writer, "flush", waits)
+    monkeypatch.setattr(time, "monotonic", lambda: monotonic() + passed_s)
+    made.start()
+    hand_over(made, ticks(1, 10))
+    passed_s = 17.0
+    assert made.news() == [] and not made.degraded
+    for _ in range(6):
+        passed_s += 1.0
+        news = made.news()
+    assert "has not answered" in news[0][1]
+    answers.set()
+    made.stop({})
+
+
 def test_full_disk_retry_interval_does_not_grow(
     small_disk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,6 +19,7 @@ Over 300 lines: one clock, of which each kind of evidence moves the same interva
 """
 
 import math
+from collections import deque
 from typing import Final
 
 from companion.mavlink.clock.epochs import WRAP_NS, BootLine
@@ -45,6 +46,10 @@ INVISIBLE_RATIO: Final = 0.1
 A point estimate, not a bound: it improves most of the latency laws tried (docs/math.md 6), and
 makes none much worse.
 """
+SETTLED_NS: Final = 5 * _NS  # time after which a clock is known to some tenths of a second
+ROUTE_LATE_NS: Final = 250 * _NS_PER_MS
+"""Lateness of a route above which the first stamps over it may be late."""
+ROUTE_STAMPS: Final = 8  # stamps in turn of which not all are later than others of their route
 MIN_INVISIBLE_NS: Final = 25 * _NS_PER_MS
 """Least limit assumed for the invisible latency, even if visible parts are shorter."""
 
@@ -72,21 +77,24 @@ class SenderClock:
         self._latency_s = 0.0
         self._doubt_ns = 0  # largest doubt of all stamps
         self._drift_max = drift_max
-        self._late_first: tuple[int, float] | None = None
-        """Sender time of the line's first stamp if that may have been late, and least offset."""
+        self._begun_ns = 0  # sender time of the line's first stamp
+        self._route: tuple[int, float] | None = None
+        """Sender time, and least offset then, by the lateness of the route; None: in time."""
+        self._least_newest_ns = deque[int](maxlen=ROUTE_STAMPS)  # such offsets of the newest stamps
         self._known: tuple[ClockKind, int, int, int] | None = None  # at the newest stamp
         self._reading: ClockReading | None = None
 
     def observe(
-        self, arrival_ns: int, boot_ms: int, doubt_ns: int = 0, *, late_ns: int = 0
+        self, arrival_ns: int, boot_ms: int, doubt_ns: int = 0, *, late_ns: int | None = None
     ) -> Stamp | None:
         """Place a stamp whose frame may have arrived up to ``doubt_ns`` earlier.
 
-        ``late_ns`` is how late the first stamp may be, since all others of its route are as late.
-        Returns None for a frame of the previous boot, and for a stamp off the line that is not yet
-        confirmed by others: that report has no time and cannot be used.
+        ``late_ns`` is how late other senders' stamps over the same route are, at most; None if
+        unknown. The first stamps may be as late. Returns None for a frame of the previous boot, and
+        for a stamp off the line that is not yet confirmed by others: that report has no time and
+        cannot be used.
         """
-        hidden_ns = 0 if self._late_first is None else self._hidden_ns()
+        hidden_ns = 0 if self._route is None else self._hidden_ns()
         placed = self._line.observe(arrival_ns, boot_ms)
         self.change = self._known = self._reading = None
         # A stamp without a place may start a line that later ones confirm, and be its floor.
@@ -97,9 +105,12 @@ class SenderClock:
             self._timesync.clear()
             self.forget_gnss()
         line, x_ns = self._line, placed.x_ns
-        late_ns = hidden_ns if placed.rebooted else late_ns
-        if late_ns:
-            self._late_first = x_ns, line.floor.heights(x_ns).upper_bound - late_ns
+        if placed.rebooted or not self._begun_ns:
+            self._begun_ns = x_ns
+        if placed.rebooted and hidden_ns:
+            self._route = x_ns, line.floor.heights(x_ns).upper_bound - hidden_ns
+        elif late_ns is not None:
+            self._follow_route(x_ns, arrival_ns, late_ns)
         if placed.ahead_ns:
             self._note_earlier(placed.ahead_ns)
         elif placed.jump_ns or line.floor.rise_ns or line.floor.jump_ns:
@@ -113,18 +124,43 @@ class SenderClock:
             sender_ns=x_ns, latency_s=latency_s, rebooted=placed.rebooted, oldest_ns=at_ns + low_ns
         )
 
+    @property
+    def is_settled(self) -> bool:
+        """Whether the clock is known well enough to tell how late others of its route are."""
+        return self._route is None and self._line.newest_ns - self._begun_ns >= SETTLED_NS
+
+    def _follow_route(self, x_ns: int, arrival_ns: int, late_ns: int) -> None:
+        """Note that a stamp may be as late as others of its route.
+
+        None of the line's first stamps need have been in time, so the least offset counts. Later
+        the largest one counts: stamps of a time at which the route was not late bound the others.
+        A single one may be later than others of its route, so the least of some in turn is taken.
+        """
+        least_ns, is_new = arrival_ns - x_ns - late_ns, x_ns - self._begun_ns < SETTLED_NS
+        if is_new:
+            known_ns = math.inf if self._route is None else self._least_ns(x_ns)
+            if late_ns > ROUTE_LATE_NS and least_ns < known_ns:
+                self._route = x_ns, least_ns
+        elif self._route is not None:
+            self._least_newest_ns.append(least_ns)
+            newest = self._least_newest_ns
+            least_ns = min(newest)
+            if len(newest) == newest.maxlen and least_ns > self._least_ns(x_ns):
+                is_late = self._line.floor.heights(x_ns).upper_bound - least_ns > ROUTE_LATE_NS
+                self._route = (x_ns, least_ns) if is_late else None
+
     def _hidden_ns(self) -> int:
-        """Return how late all stamps of the line may be, as its first one was."""
+        """Return how late all stamps of the line may be, as its route was."""
         newest_ns = self._line.newest_ns
         return max(
             0, round(self._line.floor.heights(newest_ns).upper_bound - self._least_ns(newest_ns))
         )
 
     def _least_ns(self, x_ns: int) -> float:
-        """Return the least offset at a sender time; the line's first stamp may have been late."""
-        assert self._late_first is not None
-        first_ns, least_ns = self._late_first
-        return least_ns - self._drift_max * abs(x_ns - first_ns)
+        """Return the least offset at a sender time by the lateness of the route."""
+        assert self._route is not None
+        noted_ns, least_ns = self._route
+        return least_ns - self._drift_max * abs(x_ns - noted_ns)
 
     def may_be_own(self, arrival_ns: int, boot_ms: int, late_ns: int = _MAX_DEPTH_NS) -> bool:
         """Return whether a stamp that arrived by ``arrival_ns`` may be this clock's, so late."""
@@ -310,7 +346,7 @@ class SenderClock:
         median_ns, delay_ns, best = floor.median_ns, self._constant_delay_ns, ClockKind.ENVELOPE
         low_ns = least_ns - max(delay_ns, median_ns, MIN_INVISIBLE_NS) - floor.residual_ns()
         low_ns -= self._doubt_ns
-        if self._late_first is not None:
+        if self._route is not None:
             low_ns = min(low_ns, self._least_ns(x_ns))
         low_ns = max(low_ns, sure_ns - _MAX_DEPTH_NS)
         high_ns: float = sure_ns - delay_ns

@@ -5,22 +5,17 @@ of it, since every link has its own. GLOBAL_POSITION_INT carries a boot time, so
 the same report. ADSB_VEHICLE carries none: ``adsb`` detects repeats there.
 """
 
-import math
 from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Final
 
+from companion.mavlink.trust.path_lateness import PathLateness
 from companion.values import Frame
 
 WINDOW_NS: Final = 30_000_000_000
 """How long a report is remembered: longer than the largest lag observed between links."""
 LINKS_MAX: Final = 4096  # most links counted; a log may name one for each of its frames
 LATENCIES_KEPT: Final = 256  # newest latencies kept per link
-LATE_KEPT_NS: Final = 30_000_000_000
-"""How long the newest report of a system tells how late its other messages are."""
-LATE_MAX_NS: Final = 10_000_000_000  # longest time by which a report counts as overdue
-SLOT_NS: Final = 5_000_000_000
-"""The newest one or two of these times have the largest latency and the least interval."""
 
 
 @dataclass(slots=True)
@@ -49,25 +44,6 @@ class _First:
     doubt_s: float = 0.0
 
 
-@dataclass(slots=True, kw_only=True)
-class _Lateness:
-    """How late the reports of one system over one link may be, in this slot and the one before.
-
-    newest_ns    newest arrival of a report, or of a repeat
-    latencies_s  largest latencies
-    doubt_s      how much larger the newest one may be
-    ages_s       least of the largest ages that reports may have had on arrival
-    intervals_ns least intervals between arrivals
-    """
-
-    since_ns: int
-    newest_ns: int
-    latencies_s: tuple[float, float]
-    doubt_s: float
-    ages_s: tuple[float, float] = math.inf, math.inf
-    intervals_ns: tuple[int, int] = LATE_KEPT_NS, LATE_KEPT_NS
-
-
 class Dedupe:
     """Contents of the reports of the last ``WINDOW_NS``, with counts by link."""
 
@@ -75,7 +51,7 @@ class Dedupe:
         self.shares: dict[str, LinkShare] = {}
         self._seen: OrderedDict[bytes, _First] = OrderedDict()  # in order of arrival
         self._newest: _First | None = None  # of these
-        self._lateness: dict[tuple[str, int], _Lateness] = {}  # by link and system
+        self._lateness = PathLateness()  # by link and system
 
     def is_repeat(self, frame: Frame) -> bool:
         """Count a frame; return True if the same content arrived before it, within the window."""
@@ -93,7 +69,7 @@ class Dedupe:
         if first.latency_s is not None:
             latency_s = first.latency_s + (t_ns - first.t_ns) * 1e-9
             share.latencies_s.append(latency_s)
-            self._note((frame.link, first.sysid), t_ns, latency_s, first.doubt_s)
+            self._lateness.note((frame.link, first.sysid), t_ns, latency_s, first.doubt_s)
         return True
 
     def set_latency(self, latency_s: float, age_s: float) -> None:
@@ -102,57 +78,18 @@ class Dedupe:
         assert first is not None
         first.latency_s, first.doubt_s = latency_s, age_s - latency_s
         self._share(first.link).latencies_s.append(latency_s)
-        self._note((first.link, first.sysid), first.t_ns, latency_s, first.doubt_s)
+        self._lateness.note((first.link, first.sysid), first.t_ns, latency_s, first.doubt_s)
 
     def late_s(self, frame: Frame) -> float:
         """Return how late a frame of another message may be, by the reports of its system.
 
         It may be as late as any report of the last seconds over the same link: its peers are not
         told apart. It may be later by the time for which the next report is overdue. 0 if there
-        was no report in the last ``LATE_KEPT_NS``.
+        was no report in the last ``path_lateness.KEPT_NS``.
         """
-        known = self._lateness.get((frame.link, frame.source.sysid))
-        if known is None or frame.t_ns - known.newest_ns > LATE_KEPT_NS:
-            return 0.0
-        overdue_ns = frame.t_ns - known.newest_ns - min(known.intervals_ns)
-        overdue_s = min(max(0, overdue_ns), LATE_MAX_NS) * 1e-9
-        return max(known.latencies_s) + known.doubt_s + overdue_s
-
-    def least_age_s(self, frame: Frame) -> float:
-        """Return how old the reports of a frame's system may all be on arrival, over its link.
-
-        0 if there was none in the last ``LATE_KEPT_NS``, or the first one came less than
-        ``SLOT_NS`` ago: clocks are not known so soon.
-        """
-        known = self._lateness.get((frame.link, frame.source.sysid))
-        if known is None or frame.t_ns - known.newest_ns > LATE_KEPT_NS:
-            return 0.0
-        return min(known.ages_s) if known.ages_s[1] < math.inf else 0.0
-
-    def _note(self, of: tuple[str, int], t_ns: int, latency_s: float, doubt_s: float) -> None:
-        """Note the latency of a report. Short expressions stand for calls: this runs for each."""
-        known = self._lateness.get(of)
-        if known is None:
-            if len(self._lateness) < LINKS_MAX:
-                self._lateness[of] = _Lateness(
-                    since_ns=t_ns, newest_ns=t_ns, latencies_s=(latency_s, 0.0), doubt_s=doubt_s
-                )
-            return
-        known.doubt_s = doubt_s
-        age_s = latency_s + doubt_s
-        if t_ns - known.since_ns > SLOT_NS:
-            known.since_ns = t_ns
-            known.latencies_s = latency_s, known.latencies_s[0]
-            known.ages_s = age_s, known.ages_s[0]
-            known.intervals_ns = LATE_KEPT_NS, known.intervals_ns[0]
-        else:
-            if latency_s > known.latencies_s[0]:
-                known.latencies_s = latency_s, known.latencies_s[1]
-            if age_s < known.ages_s[0]:
-                known.ages_s = age_s, known.ages_s[1]
-        interval_ns, known.newest_ns = t_ns - known.newest_ns, t_ns
-        if interval_ns < known.intervals_ns[0]:
-            known.intervals_ns = interval_ns, known.intervals_ns[1]
+        path = frame.link, frame.source.sysid
+        late_s = self._lateness.largest_s(path, frame.t_ns)
+        return 0.0 if late_s is None else late_s + self._lateness.overdue_s(path, frame.t_ns)
 
     def _share(self, link: str) -> LinkShare:
         share = self.shares.get(link)

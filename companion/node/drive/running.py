@@ -11,7 +11,8 @@ from companion.node.drive.loop import Drive, DriveStatus
 from companion.node.signals import ENDS
 
 STATUS_EVERY_S: Final = 1.0
-ENDS_S: Final = 4.0  # time limit for a device to reach its safe state at the end
+ENDS_S: Final = 3.5
+"""Time limit for a device to reach its safe state at the end: lines may take another second."""
 
 
 def run_until_stopped(

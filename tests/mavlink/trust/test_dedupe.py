@@ -171,30 +171,3 @@ def test_unknown_latency_is_not_recorded() -> None:
     assert not dedupe.is_repeat(sent(EPOCH_NS))
     assert dedupe.is_repeat(sent(EPOCH_NS + S))
     assert not dedupe.shares["a"].latencies_s
-
-
-def test_least_age_is_that_of_the_newest_two_slots() -> None:
-    dedupe, n = Dedupe(), 0
-
-    def hear(until_s: float, age_s: float) -> None:
-        nonlocal n
-        while n * 0.5 <= until_s:
-            assert not dedupe.is_repeat(sent(EPOCH_NS + n * S // 2, boot_ms=n))
-            dedupe.set_latency(0.0, age_s + n % 3)
-            n += 1
-
-    def least_s() -> float:
-        return dedupe.least_age_s(sent(EPOCH_NS + n * S // 2, source=(1, 236)))
-
-    hear(0.0, 10.0)
-    assert least_s() == 0.0  # clocks are not known yet
-    hear(4.5, 0.1)
-    assert least_s() == 0.0
-    hear(6.0, 0.1)
-    assert least_s() == 0.1
-    hear(18.0, 2.5)
-    assert least_s() == 2.5
-    hear(20.0, 0.2)
-    assert least_s() == 0.2
-    assert dedupe.least_age_s(sent(EPOCH_NS + 60 * S)) == 0.0
-    assert dedupe.least_age_s(sent(EPOCH_NS + 20 * S, link="b")) == 0.0

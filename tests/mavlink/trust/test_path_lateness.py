@@ -1,0 +1,28 @@
+"""Lateness of a path: the largest of the last seconds, and unknown after a silence."""
+
+from companion.mavlink.trust.path_lateness import KEPT_NS, SLOT_NS, PathLateness
+
+S = 1_000_000_000
+
+
+def test_lateness_is_the_largest_of_the_newest_one_or_two_slots() -> None:
+    paths = PathLateness()
+    assert paths.largest_s("a", 0) is None
+    for n in range(40):  # twice a second: late from 5 to 8 s
+        paths.note("a", n * S // 2, 2.0 if 10 <= n < 16 else 0.1, 0.2)
+        if n == 9:
+            assert paths.largest_s("a", n * S // 2) == 0.1 + 0.2
+        elif 10 <= n < 26:
+            assert paths.largest_s("a", n * S // 2) == 2.0 + 0.2
+    assert paths.largest_s("a", 20 * S) == 0.1 + 0.2
+    assert paths.largest_s("b", 20 * S) is None
+    assert paths.largest_s("a", 19 * S + S // 2 + KEPT_NS + 1) is None
+
+
+def test_report_is_overdue_after_the_least_interval_of_the_slots() -> None:
+    paths = PathLateness()
+    for n in range(4):
+        paths.note("a", n * S, 0.0, 0.0)
+    assert paths.overdue_s("a", 4 * S) == 0.0
+    assert paths.overdue_s("a", 6 * S) == 2.0
+    assert paths.overdue_s("a", 3 * S + 4 * SLOT_NS) == 10.0

@@ -22,7 +22,7 @@ from companion.mavlink.clock.sender_clock import SenderClock
 from companion.mavlink.trust.admission import admission
 from companion.mavlink.trust.adsb import Aircraft
 from companion.mavlink.trust.dedupe import Dedupe, LinkShare
-from companion.mavlink.trust.path_lateness import PathLateness
+from companion.mavlink.trust.path_lateness import RouteLateness
 from companion.mavlink.trust.remote_id import RemoteIds
 from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE, GPS2_RAW, gnss_heading, second_has_fix
 from companion.mavlink.wire.decode import ATTITUDE, decode
@@ -176,7 +176,7 @@ class Senders:
     ) -> None:
         self.aircraft = Aircraft()  # by ICAO address, over all relays
         self.remote_ids = RemoteIds()  # by radio address, for each receiver
-        self._receivers = PathLateness()  # of Remote ID, by link and sender
+        self._receivers = RouteLateness()  # of Remote ID, by link and sender
         self._carrier = carrier
         self._carrier_source = None if carrier is None else Source.parse(carrier)
         self._records = records
@@ -582,16 +582,20 @@ class Senders:
             return _refused(named, Reason.DUPLICATE)
         if named.boot_ms is None:
             return _refused(named, Reason.UNPLACED_STAMP)
-        path = frame.link, frame.source
-        late_s = self._receivers.largest_s(path, frame.t_ns)
+        route, uav = (frame.link, frame.source), named.uav
+        known = self._senders.get(uav)
+        late_s: float | None = None
+        if known is None or not known.clock.is_settled:
+            late_s = self._receivers.largest_s(route, frame.t_ns)
         late_ns = None if late_s is None else round(late_s * 1e9)
         outcome = self._telemetry(named, frame, late_ns=late_ns)
-        sender = self._senders.get(named.uav)
-        reading = sender.clock.reading() if sender and sender.clock.is_settled else None
-        if outcome.message is not None and reading is not None:
+        clock = self._senders[uav].clock
+        if outcome.message is not None and clock.is_settled and (reading := clock.reading()):
             low_ns, _, likely_ns = reading.offset_ns
             doubt_s = (likely_ns - low_ns) * 1e-9
-            self._receivers.note(path, frame.t_ns, reading.latency_s, doubt_s)
+            self._receivers.note(
+                route, uav, frame.t_ns, latency_s=reading.latency_s, doubt_s=doubt_s
+            )
         return outcome
 
     def _attitude(self, attitude: Attitude) -> FrameOutcome:

@@ -1,5 +1,6 @@
 """How late the reports of a path may arrive: the largest latencies of the last seconds."""
 
+from collections import OrderedDict
 from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Final
@@ -8,6 +9,7 @@ PATHS_MAX: Final = 4096  # most paths remembered; a log may name one for each of
 KEPT_NS: Final = 30_000_000_000
 """How long the newest report of a path tells how late others are."""
 OVERDUE_MAX_NS: Final = 10_000_000_000  # longest time by which a report counts as overdue
+ROUTE_SENDERS: Final = 16  # senders of a route that are remembered, the newest ones
 SLOT_NS: Final = 5_000_000_000
 """The newest one or two of these times have the largest latency and the least interval."""
 
@@ -65,8 +67,49 @@ class PathLateness:
             return None
         return max(known.latencies_s) + known.doubt_s
 
+    def forget(self, path: Hashable) -> None:
+        """Forget a path, if it is known."""
+        self._paths.pop(path, None)
+
     def overdue_s(self, path: Hashable, t_ns: int) -> float:
         """Return for how long the next report of a path is overdue."""
         known = self._paths[path]
         overdue_ns = t_ns - known.newest_ns - min(known.intervals_ns)
         return min(max(0, overdue_ns), OVERDUE_MAX_NS) * 1e-9
+
+
+class RouteLateness:
+    """Lateness of routes with several senders: of each sender the largest, of these the least.
+
+    So one sender with a wrong clock, or a forged one, does not make a route late.
+    """
+
+    def __init__(self) -> None:
+        self._lateness = PathLateness()
+        self._senders: dict[Hashable, OrderedDict[str, int]] = {}  # newest arrivals, by route
+
+    def note(
+        self, route: Hashable, sender: str, t_ns: int, *, latency_s: float, doubt_s: float
+    ) -> None:
+        """Note the latency of a report, and how much larger it may be."""
+        senders = self._senders.get(route)
+        if senders is None:
+            if len(self._senders) >= PATHS_MAX // ROUTE_SENDERS:
+                return
+            senders = self._senders[route] = OrderedDict()
+        senders[sender] = t_ns
+        senders.move_to_end(sender)
+        if len(senders) > ROUTE_SENDERS:
+            silent, _ = senders.popitem(last=False)
+            self._lateness.forget((route, silent))
+        self._lateness.note((route, sender), t_ns, latency_s, doubt_s)
+
+    def largest_s(self, route: Hashable, t_ns: int) -> float | None:
+        """Return how late a report may be; None if nothing is known.
+
+        Senders that were received in the last ``SLOT_NS`` tell, if there are any.
+        """
+        senders = self._senders.get(route, OrderedDict())
+        recent = [one for one, at_ns in senders.items() if t_ns - at_ns <= SLOT_NS]
+        found = [self._lateness.largest_s((route, one), t_ns) for one in recent or senders]
+        return min((one for one in found if one is not None), default=None)

@@ -97,7 +97,7 @@ class Peer:
 
     __slots__ = (
         "_sequence", "accounts", "address", "heard_ns", "key", "senders", "served",
-        "served_generation", "splitter", "versions",
+        "served_generation", "splitter", "unusable", "versions",
     )  # fmt: skip
 
     def __init__(self, key: Hashable, splitter: Splits) -> None:
@@ -110,6 +110,7 @@ class Peer:
         self.accounts: dict[Source, Account] = {}  # what admitted frames are charged to
         self.served_generation = 0  # of ``Newcomers``, when ``served`` was emptied
         self.heard_ns: int | None = None
+        self.unusable = 0  # pieces of data since the last valid frame
         self.versions = 0  # bit 0: MAVLink 1 received, bit 1: MAVLink 2 received
         self._sequence = 0
 
@@ -117,6 +118,10 @@ class Peer:
     def speaks_v1_only(self) -> bool:
         """True if the peer sent at least one frame, and all of them were MAVLink 1."""
         return self.versions == 1
+
+    def note(self, *, is_usable: bool) -> None:
+        """Note whether a piece of data had a valid frame."""
+        self.unusable = 0 if is_usable else self.unusable + 1
 
     def brings_stamps(self, source: Source, now_ns: int) -> bool:
         """Return whether this peer recently delivered a source's stamped position or attitude."""

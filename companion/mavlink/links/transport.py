@@ -59,6 +59,12 @@ REJECTED_PER_S: Final = 100.0
 
 Each takes as much time as a valid frame, and its sender is unknown, so that it cannot be limited.
 """
+UNUSABLE_MAX: Final = 64
+"""Datagrams in turn without a valid frame after which late ones of their peer are dropped.
+
+One in ``UNUSABLE_PARSED`` is parsed, so that a peer that sends valid frames again is found.
+"""
+UNUSABLE_PARSED: Final = 16
 RECEIVER_SHARE: Final = 0.3
 """Share of the time that messages of a receiver may take; further ones are skipped unparsed.
 
@@ -214,6 +220,8 @@ class Link:
         if age_ns is not None:
             self._lag.observe(t_ns, age_ns)
             t_ns -= age_ns
+            if peer.unusable >= UNUSABLE_MAX and age_ns > LATE_NS and self._is_passed_over(peer):
+                return False
         splitter = peer.splitter
         receiver = splitter if isinstance(splitter, ForeignSplitter) else None
         if receiver is not None:
@@ -226,6 +234,7 @@ class Link:
             self._newcomers.late(age_ns)
         spent_s = time.perf_counter() - began_s
         is_mixed = len(found) != 1 or isinstance(found[0], Rejection)
+        peer.note(is_usable=not is_mixed or any(isinstance(one, Frame) for one in found))
         if receiver is not None:
             took_s = time.thread_time() - began_cpu_s
             self._receiver_s.charge(took_s)
@@ -237,12 +246,17 @@ class Link:
         if now_ns >= self._newcomers.adapts_ns:
             self._newcomers.adapt(now_ns, time.thread_time(), time.process_time())
         if receiver is not None and not self.url.listens:
-            if receiver.too_late is not None:
-                raise StalledError(receiver.too_late)
-            began_ns = receiver.unfinished_ns
-            if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:
-                raise StalledError(f"no complete message in {UNFINISHED_S} s of data")
+            _require_progress(receiver, t_ns)
         return splitter.has_more
+
+    def _is_passed_over(self, peer: Peer) -> bool:
+        """Count a late datagram of a peer that sends no valid frames; parse one of some."""
+        peer.unusable += 1
+        if peer.unusable % UNUSABLE_PARSED == 0:
+            return False
+        self.status.overflowed = (self.status.overflowed or 0) + 1
+        self._note_refused(self.status.url, Reason.SOCKET_OVERFLOW, 1)
+        return True
 
     def _charge(self, peer: Peer, used: list[Received], each_s: float) -> None:
         """Charge the time that each used frame took to its sender."""
@@ -534,6 +548,15 @@ class Link:
         if self._steady is not None:
             self._steady.cancel()
             self._steady = None
+
+
+def _require_progress(receiver: ForeignSplitter, t_ns: int) -> None:
+    """Raise ``StalledError`` if a server completes no message, or its messages are too late."""
+    if receiver.too_late is not None:
+        raise StalledError(receiver.too_late)
+    began_ns = receiver.unfinished_ns
+    if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:
+        raise StalledError(f"no complete message in {UNFINISHED_S} s of data")
 
 
 def _checked_by_guard(guard: MessageSigning, item: Frame | Rejection) -> Frame | Rejection:

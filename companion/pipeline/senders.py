@@ -589,14 +589,18 @@ class Senders:
             late_s = self._receivers.largest_s(route, frame.t_ns)
         late_ns = None if late_s is None else round(late_s * 1e9)
         outcome = self._telemetry(named, frame, late_ns=late_ns)
+        if outcome.message is not None:
+            self._note_receiver(route, uav, frame.t_ns)
+        return outcome
+
+    def _note_receiver(self, route: tuple[str, Source], uav: str, t_ns: int) -> None:
+        """Note how late a report was, if the clock of its aircraft is known well enough."""
         clock = self._senders[uav].clock
-        if outcome.message is not None and clock.is_settled and (reading := clock.reading()):
+        reading = clock.reading() if clock.is_settled else None
+        if reading is not None:
             low_ns, _, likely_ns = reading.offset_ns
             doubt_s = (likely_ns - low_ns) * 1e-9
-            self._receivers.note(
-                route, uav, frame.t_ns, latency_s=reading.latency_s, doubt_s=doubt_s
-            )
-        return outcome
+            self._receivers.note(route, uav, t_ns, latency_s=reading.latency_s, doubt_s=doubt_s)
 
     def _attitude(self, attitude: Attitude) -> FrameOutcome:
         carrier = str(attitude.source)

@@ -364,6 +364,19 @@ def test_invented_ids_use_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> Non
     assert seen[Reason.TOO_MANY] + seen[Reason.UNPLACED_STAMP] == 6 * RECORDS_MAX - TRACKS_MAX
 
 
+def test_invented_remote_ids_use_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(records, "RECORDS_MAX", RECORDS_MAX)
+    monkeypatch.setattr(senders, "RECORDS_MAX", RECORDS_MAX)
+    fold, refused = pipeline(tracks={"most": TRACKS_MAX}), 0
+    for number in range(2 * RECORDS_MAX):
+        serial = b"1588E0%013dE" % number
+        fold.step(naming(0, serial=serial))
+        said = fold.step(broadcast(1, aside_m=number, serial=serial))
+        refused += any(isinstance(one, Rejection) and one.reason is Reason.TOO_MANY for one in said)
+    assert refused > RECORDS_MAX
+    assert len(fold.senders._senders) <= RECORDS_MAX
+
+
 def summary(t_s: float, **given: int) -> Frame:
     """Return a HIGH_LATENCY2 of the same aircraft, as an autopilot packs it."""
     lat, lon, alt = there(t_s)

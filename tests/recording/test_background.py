@@ -333,14 +333,17 @@ def test_time_for_which_the_process_was_stopped_is_none_of_the_disk(
     monkeypatch.setattr(time, "monotonic", lambda: monotonic() + passed_s)
     made.start()
     hand_over(made, ticks(1, 10))
-    passed_s = 17.0
-    assert made.news() == [] and not made.degraded
-    for _ in range(6):
-        passed_s += 1.0
-        news = made.news()
-    assert "has not answered" in news[0][1]
-    answers.set()
-    made.stop({})
+    try:
+        passed_s = 17.0
+        assert made.news() == [] and not made.degraded
+        news = list[tuple[Severity, str]]()
+        for _ in range(6):
+            passed_s += 1.0
+            news += made.news()
+        assert len(news) == 1 and "has not answered" in news[0][1]
+    finally:
+        answers.set()
+        made.stop({})
 
 
 def test_full_disk_retry_interval_does_not_grow(

@@ -64,8 +64,8 @@ _TOO_SLOW: Final = "the disk was too slow"
 class Rotation:
     """When a new part of a recording begins: at a size in bytes or after seconds; None: never.
 
-    One that has either limit also begins when the index of a part reaches ``INDEX_MAX_BYTES``; any
-    at ``CHANNELS_MAX`` topics.
+    With either limit, one also begins when the index of a part reaches ``INDEX_MAX_BYTES``; with or
+    without, at ``CHANNELS_MAX`` topics.
     """
 
     size_bytes: float | None = None
@@ -273,7 +273,8 @@ class BackgroundRecorder:
         try:
             self._write_parts()
         except Exception as defect:  # must not end the recording silently
-            self.failure = f"{self._where}: {type(defect).__name__}: {defect}"
+            self._why = f"{type(defect).__name__}: {defect}"
+            self.failure = f"{self._where}: {self._why}"
             self._tell(Severity.ERROR, f"nothing is recorded any more: {self.failure}")
             self._has_ended = True
             self._give_up()
@@ -434,6 +435,7 @@ class BackgroundRecorder:
     def _give_up(self) -> None:
         lost = len(self._unflushed) + len(self._queue)
         self.dropped += lost
+        self._unflushed.clear()
         self._queue.clear()
         if lost:
             self._tell(Severity.ERROR, f"the last {lost} events are not recorded: {self._why}")

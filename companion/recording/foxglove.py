@@ -123,7 +123,6 @@ class LiveChannels:
                 self._encoder.event(event)
             for output in outputs:
                 self._encoder.output(output, self._geodetic)
-            del item, event, outputs  # of megabytes, until the next one
 
     def _announce(self, outputs: Sequence[Output]) -> None:
         """Announce the topics of each new UAV: viewers can subscribe only to announced topics."""

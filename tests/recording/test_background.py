@@ -758,6 +758,7 @@ def test_defect_that_ends_the_recording_is_announced(
     assert made.degraded and "a defect" in str(made.failure) and made.dropped == 10
     (first, last) = (text for _, text in made.news())
     assert first.startswith("nothing is recorded any more") and "last 10 events" in last
+    assert last.endswith("a defect")  # not the disk
     hand_over(made, ticks(10, 20))
     assert (made.dropped, made.queued) == (20, 0)
     made.stop({})

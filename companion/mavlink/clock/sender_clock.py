@@ -49,7 +49,8 @@ makes none much worse.
 SETTLED_NS: Final = 5 * _NS  # time after which a clock is known to some tenths of a second
 ROUTE_LATE_NS: Final = 250 * _NS_PER_MS
 """Lateness of a route above which the first stamps over it may be late."""
-ROUTE_STAMPS: Final = 8  # stamps in turn of which not all are later than others of their route
+ROUTE_STAMPS: Final = 8
+"""Stamps in a row of which at least one is assumed to be no later than other senders' are."""
 MIN_INVISIBLE_NS: Final = 25 * _NS_PER_MS
 """Least limit assumed for the invisible latency, even if visible parts are shorter."""
 
@@ -79,8 +80,12 @@ class SenderClock:
         self._drift_max = drift_max
         self._begun_ns = 0  # sender time of the line's first stamp
         self._route: tuple[int, float] | None = None
-        """Sender time, and least offset then, by the lateness of the route; None: in time."""
-        self._least_newest_ns = deque[int](maxlen=ROUTE_STAMPS)  # such offsets of the newest stamps
+        """Least offset by the lateness of other senders: its sender time, and the offset, ns.
+
+        None if those of the route are in time, or unknown.
+        """
+        self._newest_routes = deque[tuple[int, int]](maxlen=ROUTE_STAMPS)
+        """The same by each of the newest stamps."""
         self._known: tuple[ClockKind, int, int, int] | None = None  # at the newest stamp
         self._reading: ClockReading | None = None
 
@@ -94,7 +99,7 @@ class SenderClock:
         for a stamp off the line that is not yet confirmed by others: that report has no time and
         cannot be used.
         """
-        hidden_ns = 0 if self._route is None else self._hidden_ns()
+        hidden_ns = 0 if self._route is None else self._hidden_ns(self._route)
         placed = self._line.observe(arrival_ns, boot_ms)
         self.change = self._known = self._reading = None
         # A stamp without a place may start a line that later ones confirm, and be its floor.
@@ -107,6 +112,7 @@ class SenderClock:
         line, x_ns = self._line, placed.x_ns
         if placed.rebooted or not self._begun_ns:
             self._begun_ns = x_ns
+            self._newest_routes.clear()
         if placed.rebooted and hidden_ns:
             self._route = x_ns, line.floor.heights(x_ns).upper_bound - hidden_ns
         elif late_ns is not None:
@@ -130,36 +136,35 @@ class SenderClock:
         return self._route is None and self._line.newest_ns - self._begun_ns >= SETTLED_NS
 
     def _follow_route(self, x_ns: int, arrival_ns: int, late_ns: int) -> None:
-        """Note that a stamp may be as late as others of its route.
+        """Note that a stamp may be as late as those of other senders over the same route.
 
-        None of the line's first stamps need have been in time, so the least offset counts. Later
-        the largest one counts: stamps of a time at which the route was not late bound the others.
-        A single one may be later than others of its route, so the least of some in turn is taken.
+        All of the line's first stamps may have been late, so the least offset of these counts.
+        After them the largest counts: when the route is in time again, stamps show how late the
+        first ones were. As single stamps may be later than those of others, each offset is the
+        least of ``ROUTE_STAMPS`` in a row.
         """
         least_ns, is_new = arrival_ns - x_ns - late_ns, x_ns - self._begun_ns < SETTLED_NS
         if is_new:
-            known_ns = math.inf if self._route is None else self._least_ns(x_ns)
+            known_ns = math.inf if self._route is None else self._aged_ns(self._route, x_ns)
             if late_ns > ROUTE_LATE_NS and least_ns < known_ns:
                 self._route = x_ns, least_ns
         elif self._route is not None:
-            self._least_newest_ns.append(least_ns)
-            newest = self._least_newest_ns
-            least_ns = min(newest)
-            if len(newest) == newest.maxlen and least_ns > self._least_ns(x_ns):
-                is_late = self._line.floor.heights(x_ns).upper_bound - least_ns > ROUTE_LATE_NS
-                self._route = (x_ns, least_ns) if is_late else None
+            newest = self._newest_routes
+            newest.append((x_ns, least_ns))
+            least = min(self._aged_ns(one, x_ns) for one in newest)
+            if len(newest) == newest.maxlen and least > self._aged_ns(self._route, x_ns):
+                is_late = self._line.floor.heights(x_ns).upper_bound - least > ROUTE_LATE_NS
+                self._route = (x_ns, least) if is_late else None
 
-    def _hidden_ns(self) -> int:
-        """Return how late all stamps of the line may be, as its route was."""
+    def _hidden_ns(self, route: tuple[int, float]) -> int:
+        """Return how late all stamps of the line may be."""
         newest_ns = self._line.newest_ns
-        return max(
-            0, round(self._line.floor.heights(newest_ns).upper_bound - self._least_ns(newest_ns))
-        )
+        floor_ns = self._line.floor.heights(newest_ns).upper_bound
+        return max(0, round(floor_ns - self._aged_ns(route, newest_ns)))
 
-    def _least_ns(self, x_ns: int) -> float:
-        """Return the least offset at a sender time by the lateness of the route."""
-        assert self._route is not None
-        noted_ns, least_ns = self._route
+    def _aged_ns(self, least: tuple[int, float], x_ns: int) -> float:
+        """Return a least offset, noted at another sender time, at this one."""
+        noted_ns, least_ns = least
         return least_ns - self._drift_max * abs(x_ns - noted_ns)
 
     def may_be_own(self, arrival_ns: int, boot_ms: int, late_ns: int = _MAX_DEPTH_NS) -> bool:
@@ -347,7 +352,7 @@ class SenderClock:
         low_ns = least_ns - max(delay_ns, median_ns, MIN_INVISIBLE_NS) - floor.residual_ns()
         low_ns -= self._doubt_ns
         if self._route is not None:
-            low_ns = min(low_ns, self._least_ns(x_ns))
+            low_ns = min(low_ns, self._aged_ns(self._route, x_ns))
         low_ns = max(low_ns, sure_ns - _MAX_DEPTH_NS)
         high_ns: float = sure_ns - delay_ns
         likely_ns = line_ns - delay_ns - INVISIBLE_RATIO * max(0.0, median_ns - delay_ns)

@@ -110,7 +110,7 @@ class Peer:
         self.accounts: dict[Source, Account] = {}  # what admitted frames are charged to
         self.served_generation = 0  # of ``Newcomers``, when ``served`` was emptied
         self.heard_ns: int | None = None
-        self.unusable = 0  # pieces of data since the last valid frame
+        self.unusable = 0  # pieces of data since the last one with an acceptable frame
         self.versions = 0  # bit 0: MAVLink 1 received, bit 1: MAVLink 2 received
         self._sequence = 0
 
@@ -119,9 +119,9 @@ class Peer:
         """True if the peer sent at least one frame, and all of them were MAVLink 1."""
         return self.versions == 1
 
-    def note(self, *, is_usable: bool) -> None:
-        """Note whether a piece of data had a valid frame."""
-        self.unusable = 0 if is_usable else self.unusable + 1
+    def note_data(self, *, has_frame: bool) -> None:
+        """Note whether a piece of data had an acceptable frame."""
+        self.unusable = 0 if has_frame else self.unusable + 1
 
     def brings_stamps(self, source: Source, now_ns: int) -> bool:
         """Return whether this peer recently delivered a source's stamped position or attitude."""
@@ -197,7 +197,7 @@ class Peers:
                 sender.component.peer = None
 
     def active_since(self, t_ns: int) -> list[Peer]:
-        """Return the peers from which a frame arrived at ``t_ns`` or later."""
+        """Return the peers from which a frame arrived at ``t_ns`` or later, even a replayed one."""
         return [p for p in self._peers.values() if p.heard_ns is not None and p.heard_ns >= t_ns]
 
     def route_to(self, source: Source) -> Peer | None:

@@ -60,9 +60,9 @@ REJECTED_PER_S: Final = 100.0
 Each takes as much time as a valid frame, and its sender is unknown, so that it cannot be limited.
 """
 UNUSABLE_MAX: Final = 64
-"""Datagrams in turn without a valid frame after which late ones of their peer are dropped.
+"""Datagrams in a row without an acceptable frame after which late ones of their peer are dropped.
 
-One in ``UNUSABLE_PARSED`` is parsed, so that a peer that sends valid frames again is found.
+One in ``UNUSABLE_PARSED`` is parsed all the same, to notice when the peer sends acceptable frames.
 """
 UNUSABLE_PARSED: Final = 16
 RECEIVER_SHARE: Final = 0.3
@@ -220,7 +220,7 @@ class Link:
         if age_ns is not None:
             self._lag.observe(t_ns, age_ns)
             t_ns -= age_ns
-            if peer.unusable >= UNUSABLE_MAX and age_ns > LATE_NS and self._is_passed_over(peer):
+            if peer.unusable >= UNUSABLE_MAX and age_ns > LATE_NS and self._drops_unparsed(peer):
                 return False
         splitter = peer.splitter
         receiver = splitter if isinstance(splitter, ForeignSplitter) else None
@@ -229,12 +229,15 @@ class Link:
             found = self._receive_within_budget(receiver, t_ns, data)
         else:
             found = splitter.feed(t_ns, data)
-        used = self._pass_on(peer, found) if found else []
+        if found:
+            used = self._pass_on(peer, found)
+        else:
+            used = []
+            peer.note_data(has_frame=False)
         if age_ns is not None and age_ns > LATE_NS:
             self._newcomers.late(age_ns)
         spent_s = time.perf_counter() - began_s
         is_mixed = len(found) != 1 or isinstance(found[0], Rejection)
-        peer.note(is_usable=not is_mixed or any(isinstance(one, Frame) for one in found))
         if receiver is not None:
             took_s = time.thread_time() - began_cpu_s
             self._receiver_s.charge(took_s)
@@ -249,8 +252,11 @@ class Link:
             _require_progress(receiver, t_ns)
         return splitter.has_more
 
-    def _is_passed_over(self, peer: Peer) -> bool:
-        """Count a late datagram of a peer that sends no valid frames; parse one of some."""
+    def _drops_unparsed(self, peer: Peer) -> bool:
+        """Drop and count a late datagram of a peer that sends no acceptable frames.
+
+        Returns False for one in ``UNUSABLE_PARSED``, which is to be parsed.
+        """
         peer.unusable += 1
         if peer.unusable % UNUSABLE_PARSED == 0:
             return False
@@ -315,6 +321,7 @@ class Link:
         """
         if self._guard is not None:
             found = [_checked_by_guard(self._guard, item) for item in found]
+        peer.note_data(has_frame=any(isinstance(item, Frame) for item in found))
         newcomers, has_timesync = self._newcomers, False
         if peer.served_generation != newcomers.generation:
             peer.served.clear()

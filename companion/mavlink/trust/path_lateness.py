@@ -60,10 +60,13 @@ class PathLateness:
         if interval_ns < known.intervals_ns[0]:
             known.intervals_ns = interval_ns, known.intervals_ns[1]
 
-    def largest_s(self, path: Hashable, t_ns: int) -> float | None:
-        """Return how late a report may be, as any of the last seconds; None if there was none."""
+    def largest_s(self, path: Hashable, t_ns: int, within_ns: int = KEPT_NS) -> float | None:
+        """Return how late a report may be, as any of the newest ones.
+
+        None if there was none in the last ``within_ns``.
+        """
         known = self._paths.get(path)
-        if known is None or t_ns - known.newest_ns > KEPT_NS:
+        if known is None or t_ns - known.newest_ns > within_ns:
             return None
         return max(known.latencies_s) + known.doubt_s
 
@@ -79,14 +82,14 @@ class PathLateness:
 
 
 class RouteLateness:
-    """Lateness of routes with several senders: of each sender the largest, of these the least.
+    """Lateness of routes with several senders: the largest of each sender, and the least of these.
 
-    So one sender with a wrong clock, or a forged one, does not make a route late.
+    Thus one sender with a wrong clock, or a forged one, does not make a route late.
     """
 
     def __init__(self) -> None:
         self._lateness = PathLateness()
-        self._senders: dict[Hashable, OrderedDict[str, int]] = {}  # newest arrivals, by route
+        self._senders: dict[Hashable, OrderedDict[str, None]] = {}  # by route; the newest is last
 
     def note(
         self, route: Hashable, sender: str, t_ns: int, *, latency_s: float, doubt_s: float
@@ -97,7 +100,7 @@ class RouteLateness:
             if len(self._senders) >= PATHS_MAX // ROUTE_SENDERS:
                 return
             senders = self._senders[route] = OrderedDict()
-        senders[sender] = t_ns
+        senders[sender] = None
         senders.move_to_end(sender)
         if len(senders) > ROUTE_SENDERS:
             silent, _ = senders.popitem(last=False)
@@ -109,7 +112,9 @@ class RouteLateness:
 
         Senders that were received in the last ``SLOT_NS`` tell, if there are any.
         """
-        senders = self._senders.get(route, OrderedDict())
-        recent = [one for one, at_ns in senders.items() if t_ns - at_ns <= SLOT_NS]
-        found = [self._lateness.largest_s((route, one), t_ns) for one in recent or senders]
-        return min((one for one in found if one is not None), default=None)
+        senders = self._senders.get(route, ())
+        for within_ns in (SLOT_NS, KEPT_NS):
+            late_s = [self._lateness.largest_s((route, one), t_ns, within_ns) for one in senders]
+            if known_s := [one for one in late_s if one is not None]:
+                return min(known_s)
+        return None

@@ -12,7 +12,7 @@ from companion.node.signals import ENDS
 
 STATUS_EVERY_S: Final = 1.0
 ENDS_S: Final = 3.5
-"""Time limit for a device to reach its safe state at the end: lines may take another second."""
+"""Time limit for a device to reach its safe state at the end; printing may take another second."""
 
 
 def run_until_stopped(
